@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -38,12 +38,14 @@ class Model:
             ``name.parameter``, ``lidar.tz`` say.
         without: what of the recordings is left out, as `Group.token` names it.
         beams: how many beams of each scan are used at most; all where None.
+        moved: unknowns that moved since CAD told of them, each by how many of its sigmas.
     """
 
     effects: tuple[Effect, ...] = effects.DEFAULT
     fixed: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     beams: int | None = None
+    moved: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)

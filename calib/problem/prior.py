@@ -54,9 +54,9 @@ class JointPrior:
             start += v.dim
         return residual, d
 
-    def loosened(self, name: str) -> JointPrior:
-        """The same, where one variable has since moved by as much as its own sigma allows."""
-        moved = [v.sigma if v.name == name else np.zeros(v.dim) for v in self.held]
+    def loosened(self, freed: Mapping[str, float]) -> JointPrior:
+        """The same, where some variables have since moved by as many times their own sigma."""
+        moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return JointPrior(self.held, self.means, covariance)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -287,7 +287,9 @@ def _of_body(block: TrackedBody, squares: np.ndarray, expected: np.ndarray) -> E
     )
 
 
-def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[str, float]:
+def misfit(
+    estimate: Estimate, beams: Errors, moved: Collection[str] = (), weighted: bool = False
+) -> dict[str, float]:
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
     For instruments that see bodies or targets the root of chi-square over its degrees of freedom,
@@ -300,6 +302,7 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     Args:
         estimate: the solution.
         beams: of all scans, as fitted.
+        moved: frames that are known to have moved since CAD told of them.
         weighted: whether groups of rows that are further off than chance puts one, and whose pull
             is bounded by a robust weight, are left out: what is left tells how right sigmas are. Of
             CAD, which has few, they count with their weight.
@@ -320,7 +323,7 @@ def misfit(estimate: Estimate, beams: Errors, weighted: bool = False) -> dict[st
     if surfaces:
         worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
         out["reference"] = float(np.sqrt(worst))
-    return out | _of_cad(estimate, weighted)
+    return out | _of_cad(estimate, moved, weighted)
 
 
 def _of_blocks(
@@ -373,9 +376,9 @@ def in_cad(problem: Problem) -> frozenset[str]:
     return frozenset(t.variable for t in terms if isinstance(t.effect, FrameOffset))
 
 
-def _of_cad(estimate: Estimate, weighted: bool) -> dict[str, float]:
+def _of_cad(estimate: Estimate, moved: Collection[str], weighted: bool) -> dict[str, float]:
     """Of the places that frames have in CAD, as far as others contradict them (Birge 1932)."""
-    frames = in_cad(estimate.problem)
+    frames = in_cad(estimate.problem) - set(moved)
     start = np.cumsum([0, *(u.dim for u in estimate.variables)])
     variance = np.diag(estimate.covariance)
     chi2 = left = 0.0

@@ -119,9 +119,15 @@ def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:
+    links = [link for link in summary.get("links", ()) if link["moved"]]
+    known = {name for link in links for name in (link["name"], *_parameters(link))}
     for name, move in moves(summary).items():
-        if move["move_sigmas"] > FAR_FROM_CAD:
+        if move["move_sigmas"] > FAR_FROM_CAD and name not in known:
             yield move_told(name, move)
+
+
+def _parameters(link: Mapping[str, Any]) -> list[str]:
+    return [f"{link['name']}.{parameter}" for parameter in link["parameters"]]
 
 
 def _told(lines: Iterator[str]) -> list[str]:

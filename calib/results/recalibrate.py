@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,13 @@ ALARM = 0.01  # chance that anything is called moved when nothing has
 # Of the earlier variance left: less than that, and the new data say something. A choice: they took
 # 5 % off the earlier sigma.
 LEFT_VARIANCE = 0.9
+# A link that moved may have gone by as many of CAD's sigmas: to 0.1 m, of a mount known to 0.1 mm.
+# Between two of them evidence hardly differs.
+FREEDOMS = 2.0 ** np.arange(11)
+# Odds by which one link explains better than another, from which on it is named alone: "strong"
+# evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
+STRONG_ODDS = 20.0
+MOST_FITS = 4  # of one recalibration; two, where moves are small enough to be linear
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,8 @@ class Link:
         sigma: (n,) of the change where it moved, else of the estimate now.
         parameters: (n,) names.
         units: (n,).
+        freed: by how many of CAD's sigmas the fit let it go from the earlier value; 0 where held.
+        instead: links of which one may have moved in its place: the data cannot tell.
     """
 
     name: str
@@ -48,6 +57,8 @@ class Link:
     sigma: np.ndarray
     parameters: tuple[str, ...]
     units: tuple[str, ...]
+    freed: float = 0.0
+    instead: tuple[str, ...] = ()
 
 
 def earlier(problem: Problem, solution: Solution) -> JointPrior:
@@ -81,9 +92,13 @@ def as_let_go(prior: JointPrior, links: Iterable[Mapping[str, Any]]) -> JointPri
         prior: that solution.
         links: what became of each, as `summary.json` has it.
     """
-    for link in links:
-        prior = prior.loosened(link["name"]) if link["moved"] else prior
-    return prior
+    return prior.loosened(freed(links))
+
+
+def freed(links: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """By how many of CAD's sigmas a fit let each link go, 0 where it was held, as `summary.json`
+    has it. Those of earlier versions let go by one sigma what had moved."""
+    return {link["name"]: link.get("freed", float(link["moved"])) for link in links}
 
 
 class RefittedPrior(NamedTuple):
@@ -118,33 +133,165 @@ def solve_from(
     return *found[-1], links
 
 
+@dataclass(frozen=True, eq=False)
+class NewerData:
+    """What newer data alone say of all that a joint prior holds: their normal equations.
+
+    Args:
+        information: (P, P) of the tangents from the earlier values.
+        right: (P,).
+        beyond: (P, P) by how much more the right side scatters than the information has it.
+    """
+
+    information: np.ndarray
+    right: np.ndarray
+    beyond: np.ndarray
+
+    @classmethod
+    def of(cls, prior: JointPrior, now: RefittedPrior) -> NewerData:
+        """From a fit to them and to a prior."""
+        scale = np.sqrt(np.diag(prior.covariance))
+        both = np.outer(scale, scale)
+        weight, known = (np.linalg.inv(m / both) for m in (now.graph, prior.covariance))
+        beyond = weight @ ((now.covariance - now.graph) / both) @ weight
+        right = weight @ (now.change / scale)
+        return cls((weight - known) / both, right / scale, beyond / both)
+
+    def fitted(self, prior: JointPrior) -> RefittedPrior:
+        """A fit to them from another prior of the same means: one step, as all is linear here."""
+        scale = np.sqrt(np.diag(prior.covariance))
+        both = np.outer(scale, scale)
+        known = np.linalg.inv(np.linalg.inv(prior.covariance / both) + self.information * both)
+        wide = known + known @ (self.beyond * both) @ known
+        return RefittedPrior(scale * (known @ (self.right * scale)), known * both, wide * both)
+
+
 def let_go(prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior]) -> list[Link]:
     """What became of each link since an earlier solution.
 
-    The link that explains the contradiction between prior and data best is taken to have moved by
-    as much as CAD was unsure of it, and the fit repeated, until none is beyond chance (1 % over all
-    links).
+    Links that contradict prior and data beyond chance (1 % over all links) are taken to have moved,
+    and the fit is repeated with these let go, until it finds no others. So are links of which one
+    may have moved in their place, as their estimates are no surer.
 
     Args:
         prior: the earlier solution.
         fit: from it, or from the same where links were let go, to the newer data.
     """
-    moved: dict[str, _Test] = {}
+    fits: list[dict[str, float]] = []
+    free: dict[str, float] = {}
     while True:
-        now = fit(prior)
-        tests = _tests(prior, now)
-        found = {n: test for n, test in tests.items() if test is not None and n not in moved}
-        worst = min(found, key=found.get, default=None)
-        if worst is None or found[worst].p > ALARM / len(tests):
+        held = prior.loosened(free)
+        data = NewerData.of(held, fit(held))
+        fits.append(free)
+        moved = _moved(prior, data)
+        instead = _instead(prior, data, moved)
+        found = {n: f for each in instead.values() for n, f in each.items()} | moved
+        if len(fits) == MOST_FITS or any(_alike(found, earlier) for earlier in fits):
             break
-        moved[worst] = found[worst]
-        prior = prior.loosened(worst)
-    tests |= moved
-    return [_link(v, prior, now, tests[v.name], v.name in moved) for v in prior.held]
+        free = found
+    links, held = [], prior.loosened(moved)
+    for v in prior.held:
+        others = {n: f for n, f in moved.items() if n != v.name}
+        p_value = _tests(prior.loosened(others), data)[v.name]
+        link = _link(v, held, data.fitted(held), p_value, moved.get(v.name, 0.0))
+        alike = tuple(instead.get(v.name, {}))
+        links.append(replace(link, freed=fits[-1].get(v.name, 0.0), instead=alike))
+    return links
 
 
-def _tests(prior: JointPrior, now: RefittedPrior) -> dict[str, _Test | None]:
-    """Per link, a test of its not having moved; None where the data cannot tell.
+def _alike(freed: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether the same links are let go, each within a step of the grid."""
+    return freed.keys() == other.keys() and all(
+        abs(np.log2(f / other[name])) <= 1.0 for name, f in freed.items()
+    )
+
+
+def _moved(prior: JointPrior, data: NewerData) -> dict[str, float]:
+    """The links that moved, each with by how many of CAD's sigmas it may have.
+
+    Of those beyond chance beside the ones that moved already, the next is that with the greatest
+    evidence. Any that is not beyond chance beside all others did not move.
+    """
+    moved: dict[str, float] = {}
+    evidence = _Evidence.of(prior, data)
+    for _ in range(2 * len(prior.held)):
+        tests = _tests(prior.loosened(moved), data)
+        limit = ALARM / len(tests)
+        beyond = [n for n, p in tests.items() if p is not None and p <= limit and n not in moved]
+        if not beyond:
+            break
+        moved = max((evidence.freest(moved, name) for name in beyond), key=evidence.gain)
+        for name in list(moved)[:-1]:
+            others = {n: f for n, f in moved.items() if n != name}
+            p_value = _tests(prior.loosened(others), data)[name]
+            moved = moved if p_value is not None and p_value <= limit else others
+    return moved
+
+
+def _instead(
+    prior: JointPrior, data: NewerData, moved: Mapping[str, float]
+) -> dict[str, dict[str, float]]:
+    """Per link that moved those that explain nearly as much in its place, and how free each is."""
+    evidence, found = _Evidence.of(prior, data), {}
+    for name in moved:
+        others = {n: f for n, f in moved.items() if n != name}
+        ways = {v.name: evidence.freest(others, v.name) for v in prior.held if v.name not in moved}
+        enough = max(evidence.gain(moved) - np.log(STRONG_ODDS), evidence.gain(others))
+        found[name] = {n: way[n] for n, way in ways.items() if evidence.gain(way) > enough}
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """How much likelier data and prior are where some links moved; see `_tests` for the force and
+    its spread.
+
+    With moves ``N(0, D)`` the force f of those links is ``N(0, W + W D W)``, W its spread. So the
+    log of the likelihood gains ``(f' (W + D^-1)^-1 f - log|1 + D W|) / 2``. By how many of CAD's
+    sigmas a link may move is half-Cauchy beforehand (Gelman 2006, Bayesian Analysis 1), here per
+    step of a grid of logarithms.
+    """
+
+    force: np.ndarray
+    spread: np.ndarray
+    sigma: np.ndarray
+    blocks: Mapping[str, slice]
+
+    @classmethod
+    def of(cls, prior: JointPrior, data: NewerData) -> _Evidence:
+        _, force, spread = _force(prior, data.fitted(prior))
+        scale = np.sqrt(np.diag(prior.covariance))
+        sigma = np.concatenate([v.sigma for v in prior.held]) / scale
+        return cls(force, spread, sigma, blocks_of(prior.held))
+
+    def gain(self, freed: Mapping[str, float]) -> float:
+        if not freed:
+            return 0.0
+        rows = np.concatenate([np.r_[self.blocks[name]] for name in freed])
+        root = np.concatenate([f * self.sigma[self.blocks[name]] for name, f in freed.items()])
+        told, axes = np.linalg.eigh(self.spread[np.ix_(rows, rows)] * np.outer(root, root))
+        size = 1.0 + np.maximum(told, 0.0)  # less is rounding
+        explained = np.square(axes.T @ (root * self.force[rows])) / size
+        expected = sum(np.log(2.0 * f / (1.0 + f * f)) for f in freed.values())
+        return float(np.sum(explained - np.log(size)) / 2 + expected)
+
+    def freest(self, freed: Mapping[str, float], name: str) -> dict[str, float]:
+        """Some links that are let go, and one more, as far as evidence has it."""
+        ways = [{**freed, name: float(f)} for f in FREEDOMS]
+        return max(ways, key=self.gain)
+
+
+def _force(prior: JointPrior, now: RefittedPrior) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of a fit, in units of the prior's sigmas: the prior's weights P (P, P), the force ``P d``
+    (P,) by which it pulls, and the spread (P, P) of that where nothing moved."""
+    scale = np.sqrt(np.diag(prior.covariance))
+    P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
+    known = (2.0 * now.graph - now.covariance) / np.outer(scale, scale)
+    return P, P @ (now.change / scale), P - P @ known @ P
+
+
+def _tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
+    """Per link, the p-value of its not having moved; None where the data cannot tell.
 
     Baarda's test of a group of observations, which the prior's means m of covariance S are. With
     nothing moved, ``d = now - m ~ N(0, V)``, ``V = S - S_now`` and what rows that err together add
@@ -154,39 +301,28 @@ def _tests(prior: JointPrior, now: RefittedPrior) -> dict[str, _Test | None]:
 
     Baarda 1968, A testing procedure for use in geodetic networks.
     """
-    scale = np.sqrt(np.diag(prior.covariance))
-    P = np.linalg.inv(prior.covariance / np.outer(scale, scale))
-    known = (2.0 * now.graph - now.covariance) / np.outer(scale, scale)
-    force = P @ (now.change / scale)
-    spread = P - P @ known @ P
+    P, force, spread = _force(prior, data.fitted(prior))
     blocks = blocks_of(prior.held)
     return {name: _test(force[k], spread[k, k], P[k, k]) for name, k in blocks.items()}
 
 
-class _Test(NamedTuple):
-    """The less likely, the smaller: by p, and by the statistic where p is 0 in floating point."""
-
-    p: float
-    minus_statistic: float
-
-
-def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> _Test | None:
-    """Of a force ~ N(0, spread), along the axes that anything but the prior holds."""
+def _test(force: np.ndarray, spread: np.ndarray, precision: np.ndarray) -> float | None:
+    """The p-value of a force ~ N(0, spread), along the axes that anything but the prior holds."""
     root = np.linalg.inv(np.linalg.cholesky(precision))
     told, axes = np.linalg.eigh(root @ spread @ root.T)
     use = told > 1.0 - LEFT_VARIANCE
     if not use.any():
         return None
     statistic = float((np.square(axes.T @ root @ force)[use] / told[use]).sum())
-    return _Test(float(chdtrc(use.sum(), statistic)), -statistic)
+    return float(chdtrc(use.sum(), statistic))
 
 
 def _link(
     variable: Unknown,
     prior: JointPrior,
     now: RefittedPrior,
-    test: _Test | None,
-    moved: bool,
+    p_value: float | None,
+    freed: float,
 ) -> Link:
     """The link, with the move that explains all changes best where it is the one that moved.
 
@@ -195,14 +331,14 @@ def _link(
 
     Args:
         variable: the link.
-        prior: as it then was.
+        prior: with what moved let go.
         now: all that it holds, fitted.
-        test: of the link.
-        moved: whether it did.
+        p_value: of the link.
+        freed: by how many of CAD's sigmas it may have moved; 0 where it did not.
     """
     k, change, covariance = blocks_of(prior.held)[variable.name], now.change, now.covariance
-    if moved:
-        D = np.diag(np.square(variable.sigma))
+    if freed:
+        D = np.diag(np.square(freed * variable.sigma))
         scale = np.sqrt(np.diag(prior.covariance))
         P = np.linalg.inv(prior.covariance / np.outer(scale, scale)) / np.outer(scale, scale)
         G = D @ P[k]
@@ -212,8 +348,8 @@ def _link(
         change, covariance = change[k], covariance[k, k]
     return Link(
         name=variable.name,
-        moved=moved,
-        p_value=test.p if test else None,
+        moved=freed > 0.0,
+        p_value=p_value,
         change=change,
         sigma=np.sqrt(np.diag(covariance)),
         parameters=variable.dofs,

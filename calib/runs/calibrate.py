@@ -242,7 +242,8 @@ def _fit(
     rows = instrument_rows(estimate)
     write_rows(folder / RESIDUALS, rows)
     by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
-    summary |= {"misfit": misfit(estimate, seen), "misfit_by": by}
+    let_go = [link.name for link in links or () if link.freed]
+    summary |= {"misfit": misfit(estimate, seen, let_go), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
@@ -253,8 +254,7 @@ def _fit(
     summary |= {"up": up} if (up := up_of(estimate, widened)) else {}
     summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, widened)) else {}
     summary["seconds"] = time.monotonic() - began
-    if links is not None:
-        summary["links"] = [link_document(link) for link in links]
+    summary |= {} if links is None else {"links": [link_document(link) for link in links]}
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
@@ -392,4 +392,6 @@ def link_document(link: Link) -> dict[str, Any]:
         "units": link.units,
         "change": link.change,
         "sigma": link.sigma,
+        "freed": link.freed,
+        "instead": link.instead,
     }

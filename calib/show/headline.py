@@ -55,21 +55,41 @@ def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORD
         links: as `summary.json` has them.
         words: in which it is told.
     """
-    moved = [link for link in links if link["moved"]]
-    silent = [link["name"] for link in links if link["p_value"] is None]
+    moved, still, silent = by_what_became(links)
     if moved:
-        out = "; ".join(f"{link['name']} {' and '.join(_changes(link, words))}" for link in moved)
-        out += f"; {words.no_other}" if len(moved) < len(links) - len(silent) else ""
+        out = "; ".join(
+            f"{link['name']} {' and '.join(_changes(link, words))}{in_its_place(link)}"
+            for link in moved
+        )
+        out += f"; {words.no_other}" if still else ""
     else:
         out = words.none
     if silent:
-        out += f"; {words.silent.format(', '.join(silent))}"
+        out += f"; {words.silent.format(', '.join(link['name'] for link in silent))}"
     return f"{out}."
+
+
+def by_what_became(links: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], ...]:
+    """The links that moved, those that did not, and those of which the data say nothing; one that
+    may have moved in place of another is none of these."""
+    moved = [link for link in links if link["moved"]]
+    instead = {name for link in moved for name in link.get("instead", ())}
+    others = [link for link in links if not link["moved"] and link["name"] not in instead]
+    told = [link for link in others if link["p_value"] is not None]
+    return moved, told, [link for link in others if link["p_value"] is None]
+
+
+def in_its_place(link: Mapping[str, Any]) -> str:
+    """Which others may have moved and not this one, if any."""
+    others = link.get("instead", ())
+    if not others:
+        return ""
+    return f" (or, in its place, {' or '.join(others)}: these data do not tell which)"
 
 
 def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
     """By how much a link moved: of a frame along and about the axes that show it, of an effect its
-    parameters that do, or, where these are many, their rms."""
+    parameters that do, or, where several do, the rms of all."""
     names, change, sigma = link["parameters"], np.array(link["change"]), np.array(link["sigma"])
     of_frame = {"tx", "rx"} <= set(names)
     certain = np.abs(change) > TOLD_AXES * sigma
@@ -80,7 +100,8 @@ def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
         if not len(mine):
             continue
         if not of_frame and len(mine) > 1:
-            yield f"{words.changed} {scale * np.sqrt(np.mean(change[mine] ** 2)):.2f} {told} rms"
+            every = change[np.array(link["units"]) == unit]
+            yield f"{words.changed} {scale * np.sqrt(np.mean(every**2)):.2f} {told} rms"
             continue
         cells = [f"{scale * change[i]:+.2f} ± {scale * sigma[i]:.2f} {told}" for i in mine]
         if not of_frame:

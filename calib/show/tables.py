@@ -19,7 +19,7 @@ from calib.residuals.groups import CAD
 from calib.results.outstanding import shown, standing_out, together_told
 from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 from calib.runs.estimates import VariableEstimate, variable_estimates
-from calib.show.headline import MOVED_WORDS, Words, closing, moved_sentence
+from calib.show.headline import MOVED_WORDS, Words, by_what_became, closing, moved_sentence
 from calib.show.misfit import beams_told
 from chains import escape
 
@@ -333,16 +333,13 @@ def print_links(
     """Print what has moved since an earlier run, and what has not."""
     console.print(moved_sentence(links, words), style="bold")
     console.print()
-    rows, still = [], []
-    for link in links:
-        if link["moved"]:
-            rows.append((link["name"], f"{_change(link)}; {chance(link['p_value'])}"))
-        elif link["p_value"] is not None:
-            still.append(f"{link['name']} ({chance(link['p_value'])})")
-    if rows:
+    moved, still, _ = by_what_became(links)
+    if moved:
+        rows = [(link["name"], f"{_change(link)}; {chance(link['p_value'])}") for link in moved]
         print_pairs(console, words.title, rows)
     if still:
-        print_pairs(console, words.title_of_none, [("", ", ".join(still))])
+        told = ", ".join(f"{link['name']} ({chance(link['p_value'])})" for link in still)
+        print_pairs(console, words.title_of_none, [("", told)])
 
 
 def _change(link: Mapping[str, Any]) -> str:

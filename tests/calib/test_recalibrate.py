@@ -1,5 +1,6 @@
 """Recalibration: who has moved is found, and by how much, however much links have in common."""
 
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,10 +13,24 @@ from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results import recalibrate
 from calib.results.intervals import Intervals
+from calib.results.recalibrate import NewerData, as_let_go, let_go
+from calib.runs.calibrate import link_document
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0
 SIZE = DIM * len(NAMES)
+
+
+def linked(name, sigma):
+    """A link of which CAD is so sure."""
+    return Unknown(
+        name=name,
+        kind="vector",
+        mean=np.zeros(len(sigma)),
+        sigma=sigma,
+        dofs=tuple("abc"[: len(sigma)]),
+        units=("m",) * len(sigma),
+    )
 
 
 def as_the_rows_have_them(estimate, _):
@@ -42,17 +57,7 @@ def as_the_graph_has_them(estimate, _):
 def world(monkeypatch):
     """A linear world: links of which sums are seen, once before and once after."""
     rng = np.random.default_rng(5)
-    variables = [
-        Unknown(
-            name=name,
-            kind="vector",
-            mean=np.zeros(DIM),
-            sigma=np.full(DIM, CAD_SIGMA),
-            dofs=("a", "b", "c"),
-            units=("m",) * 3,
-        )
-        for name in NAMES
-    ]
+    variables = [linked(name, np.full(DIM, CAD_SIGMA)) for name in NAMES]
     J = rng.normal(size=(40, SIZE)) / 0.03
     J[:, DIM : 2 * DIM] = J[:, :DIM] @ np.diag([0.5, 2.0, 1.0])  # mount and lidar: sums only
     J[:, 3 * DIM :] = 0.0
@@ -119,12 +124,62 @@ def test_what_moved_is_found_and_its_move_has_an_honest_sigma(world):
     assert draws[0]["arm"].sigma.max() < 0.1
 
 
-def test_of_links_seen_only_together_one_is_named(world):
+@pytest.mark.parametrize("size", [0.5, 2.0, 8.0])  # of CAD's sigmas
+def test_of_links_seen_only_together_either_may_have_moved(world, size):
+    """However far: what CAD says of one does not make the other move as well."""
     moved = np.zeros(SIZE)
-    moved[DIM] = 0.5
+    moved[DIM] = size
     links = world(moved)
-    assert sum(links[name].moved for name in ("mount", "lidar")) == 1
-    assert not links["arm"].moved
+    (one,) = (name for name in ("mount", "lidar") if links[name].moved)
+    other = "mount" if one == "lidar" else "lidar"
+    assert links[one].instead == (other,) and not links["arm"].moved
+    seen = links[one].change * (0.5 if one == "lidar" else 1.0)
+    assert seen[0] == pytest.approx(0.5 * size, abs=0.1)
+    # Which it was is not known, so neither is told more surely than CAD had it.
+    assert min(links[name].freed for name in (one, other)) >= max(1.0, size / 4)
+
+
+@pytest.mark.parametrize("size", [3.0, 10.0, 40.0])
+def test_a_link_that_moved_further_than_cad_allows_is_named_alone(world, size):
+    moved = np.zeros(SIZE)
+    moved[2 * DIM] = size
+    links = world(moved)
+    assert [n for n in NAMES if links[n].moved] == ["arm"] and links["arm"].instead == ()
+    off = (links["arm"].change - moved[2 * DIM : 3 * DIM]) / links["arm"].sigma
+    assert np.abs(off).max() < 4.0
+    assert links["arm"].freed == pytest.approx(size / np.sqrt(DIM), rel=1.0)
+
+
+def test_a_link_that_cad_holds_too_well_did_not_move():
+    """Of two that are seen only together, the one that CAD is unsure of."""
+    rng, sigma = np.random.default_rng(11), np.repeat([0.02, 3.0, 1.0], 2)
+    names, moved = ("length", "zero", "other"), Counter()
+    links = [linked(n, sigma[2 * i : 2 * i + 2]) for i, n in enumerate(names)]
+    for _ in range(100):
+        J = rng.normal(size=(30, 6)) / 0.03
+        J[:, :2] = J[:, 2:4]
+        cad, information = np.diag(sigma**-2.0), J.T @ J
+        then, truth = np.linalg.inv(information + cad), sigma * rng.normal(size=6)
+        mean = then @ J.T @ (J @ truth + rng.normal(size=30))
+        truth[2:4] += [3.0, -4.0]
+        right = J.T @ (J @ (truth - mean) + rng.normal(size=30))
+        data = NewerData(information, right, np.zeros((6, 6)))
+        found = let_go(JointPrior(links, {}, then), data.fitted)
+        moved[tuple((link.name, link.instead) for link in found if link.moved)] += 1
+    assert moved[("zero", ()),] >= 98  # 1 % of alarms
+
+
+def test_what_was_let_go_is_let_go_again(world):
+    """As the factor graph of a run that was fitted from another has it."""
+    moved = np.zeros(SIZE)
+    moved[2 * DIM] = 10.0
+    links = [link_document(link) for link in world(moved).values()]
+    prior = JointPrior([linked(n, np.ones(DIM)) for n in NAMES], {}, np.eye(SIZE))
+    freed = as_let_go(prior, links).covariance - np.eye(SIZE)
+    assert freed[2 * DIM, 2 * DIM] == links[2]["freed"] ** 2 > 9.0
+    assert np.count_nonzero(freed) == DIM
+    del links[2]["freed"]  # a run of an earlier version: by CAD's own sigma
+    assert as_let_go(prior, links).covariance[2 * DIM, 2 * DIM] == 2.0
 
 
 def test_what_nobody_saw_is_not_judged(world):

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.problem.prior import JointPrior
-from calib.results.recalibrate import ALARM, Link, RefittedPrior, blocks_of, let_go
+from calib.results.recalibrate import ALARM, Link, NewerData, blocks_of, let_go
 from calib.runs.asked.pair import Covariances, Pair
 from calib.runs.calibrate import link_document
 from calib.runs.run import Run, solution_digest
@@ -197,12 +197,8 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     of_cad = cad * (least**2 - 1.0 + max(wider**2 - least**2, 0.0) * pair.is_frame)
     beyond = _nowhere_negative(weight @ (reported - graph) @ weight - np.diag(of_cad))
 
-    def fit(prior: JointPrior) -> RefittedPrior:
-        known = np.linalg.inv(np.linalg.inv(prior.covariance / scale) + information)
-        wide = known + known @ beyond @ known
-        return RefittedPrior(sigma * (known @ force), scale * known, scale * wide)
-
-    return let_go(JointPrior(pair.held, pair.then, pair.first.reported), fit)
+    data = NewerData(information / scale, force / sigma, beyond / scale)
+    return let_go(JointPrior(pair.held, pair.then, pair.first.reported), data.fitted)
 
 
 def _nowhere_negative(matrix: np.ndarray) -> np.ndarray:
