@@ -13,11 +13,15 @@ from calib.problem.unknowns import Key, Unknown
 from calib.results.recalibrate import RefittedPrior, let_go
 from calib.runs.asked.moved import _apart, _differences, moved
 from calib.runs.asked.pair import Covariances, Pair, unknowns_of
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.show.comparison import moved_document
+from calib.show.headline import moved_sentence
 from chains.errors import InputError
 from sensors.recording import write_table
 
+from ..mishaps import Scene
 from .bumps import BUMP, bumped
 
 NAMES, DIM = ("mount", "lidar", "arm", "unseen"), 3
@@ -218,6 +222,27 @@ def test_two_plain_runs_tell_what_the_fit_from_the_first_tells(runs):
             assert link["p_value"] == pytest.approx(other["p_value"], abs=0.15)
     sentence = moved_document(plain)["sentence"]
     assert sentence.startswith("lidar moved ") and sentence.endswith("; nothing else moved.")
+
+
+@pytest.mark.slow
+def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_path):
+    """By 8 of CAD's sigmas. Only between its markers and the arm's base is the rig's base seen: it
+    may be either, and no third."""
+    shutil.copytree(runs["a"].folder.parent / "after", tmp_path / "after")
+    scene, turn = Scene(tmp_path / "after", np.random.default_rng()), np.array([0.025, 0, 0])
+    scene.move("base_markers", list(range(len(scene.names))), np.zeros(3), turn)
+    run = calibrate([tmp_path / "after"], tmp_path / "run", hold_out="none", prior=runs["a"].folder)
+    links = {link["name"]: link for link in run.summary["links"]}
+    alike, moved = {"base_markers", "arm_base"}, [n for n in links if links[n]["moved"]]
+    (base,) = alike.intersection(moved)
+    assert set(moved) == {base, "lidar"} and {base, *links[base]["instead"]} == alike
+    found = np.linalg.norm(np.array(links[base]["change"])[:3])
+    assert found == pytest.approx(0.025, abs=0.0005)
+    assert not links["lidar"]["instead"]
+    assert f"(or, in its place, {links[base]['instead'][0]}: these" in moved_sentence(
+        list(links.values())
+    )
+    assert not [each for each in diagnose(run).blunders if each["kind"] == "frame"]
 
 
 @pytest.mark.slow
