@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
 from calib.effects import FrameOffset
@@ -104,8 +105,8 @@ def freed(links: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 class RefittedPrior(NamedTuple):
     """What a joint prior holds, fitted to newer data.
 
-    ``change`` (P,) is now minus then; ``graph`` and ``covariance`` (P, P) say how well it is known
-    now, as rows that err alone have it and as its intervals have it.
+    ``change`` (P,) is now minus then, as a tangent there; ``graph`` and ``covariance`` (P, P) say
+    how well it is known now, as rows that err alone have it and as its intervals have it.
     """
 
     change: np.ndarray
@@ -126,8 +127,9 @@ def solve_from(
         freed = shapes_freed(estimate, model, prior)
         known = intervals(freed, progress)
         found.append((estimate, freed, known))
-        held = known.of([v.name for v in prior.held])
-        return RefittedPrior(_change(prior, estimate), held.graph, held.covariance)
+        held, (change, turned) = known.of([v.name for v in prior.held]), _change(prior, estimate)
+        about_then = (turned @ each @ turned.T for each in (held.graph, held.covariance))
+        return RefittedPrior(change, *about_then)
 
     links = let_go(prior, fit)
     return *found[-1], links
@@ -357,10 +359,16 @@ def _link(
     )
 
 
-def _change(prior: JointPrior, estimate: Estimate) -> np.ndarray:
-    """Now minus then of all that the prior holds, as one tangent."""
-    values = ((v, prior.means[v.name], estimate.values[v.name]) for v in prior.held)
-    return np.concatenate([v.difference(then, now) for v, then, now in values])
+def _change(prior: JointPrior, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """Now minus then of all that the prior holds (P,), as one tangent at its means; and how that
+    goes (P, P) with a tangent at the estimate, of which covariances are: a frame that is turned far
+    has other axes."""
+    changes, by = [], []
+    for v in prior.held:
+        change = v.difference(prior.means[v.name], estimate.values[v.name])
+        changes.append(change)
+        by.append(se3.right_jacobian_inverse(change) if v.kind == "pose" else np.eye(v.dim))
+    return np.concatenate(changes), block_diag(*by)
 
 
 def blocks_of(variables: Sequence[Unknown]) -> dict[str, slice]:

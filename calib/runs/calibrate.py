@@ -229,7 +229,8 @@ def _fit(
     _refuse_nothing(problem, seen)
     bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
     large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
-    cad = large.pop(CAD, 1.0) if before is None else 1.0  # an earlier run stands in place of CAD
+    of_cad = large.pop(CAD, 1.0)
+    cad = of_cad if before is None else 1.0  # else an earlier run stands in place of CAD
     widened = max([1.0, *large.values()])
     known = known.at_least(widened, cad)
     calibration = known.of([v.name for v in estimate.variables])
@@ -239,8 +240,7 @@ def _fit(
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    rows = instrument_rows(estimate)
-    write_rows(folder / RESIDUALS, rows)
+    write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
     let_go = [link.name for link in links or () if link.freed]
     summary |= {"misfit": misfit(estimate, seen, let_go), "misfit_by": by}

@@ -242,6 +242,7 @@ def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_pa
     assert f"(or, in its place, {links[base]['instead'][0]}: these" in moved_sentence(
         list(links.values())
     )
+    assert run.summary["sigmas_widened_by"] == 1.0 and run.summary["misfit"]["cad"] < 1.7
     assert not [each for each in diagnose(run).blunders if each["kind"] == "frame"]
 
 

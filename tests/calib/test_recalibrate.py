@@ -10,11 +10,12 @@ from scipy.stats import kstest
 
 from calib.problem.model import Model
 from calib.problem.prior import JointPrior
-from calib.problem.unknowns import Unknown
+from calib.problem.unknowns import Unknown, pose_unknown
 from calib.results import recalibrate
 from calib.results.intervals import Intervals
 from calib.results.recalibrate import NewerData, as_let_go, let_go
 from calib.runs.calibrate import link_document
+from chains import se3
 
 NAMES = ("mount", "lidar", "arm", "unseen")
 DIM, CAD_SIGMA = 3, 1.0
@@ -184,3 +185,17 @@ def test_what_was_let_go_is_let_go_again(world):
 
 def test_what_nobody_saw_is_not_judged(world):
     assert world(np.zeros(SIZE))["unseen"].p_value is None
+
+
+def test_a_frame_that_is_turned_far_has_other_axes():
+    """How its change goes with a step at the estimate, by differences."""
+    then, now = se3.exp([0.3, -0.2, 0.1, 1.0, 2.0, -0.5]), se3.exp([-0.2, 0.4, 0.9, 0.5, 1.0, 0.5])
+    faro = pose_unknown("faro", then)
+    prior = JointPrior([faro, linked("mount", np.ones(2))], {"faro": then, "mount": 0.0}, np.eye(8))
+
+    def change(step):
+        values = {"faro": now @ se3.exp(step[:6]), "mount": step[6:]}
+        return recalibrate._change(prior, SimpleNamespace(values=values))
+
+    by_differences = [(change(x)[0] - change(-x)[0]) / 2e-6 for x in 1e-6 * np.eye(8)]
+    assert change(np.zeros(8))[1] == pytest.approx(np.transpose(by_differences), abs=1e-7)
