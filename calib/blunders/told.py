@@ -124,6 +124,43 @@ def not_as_drawn(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, A
             yield {**_otherwise("frame", name, CAD, whole(said)), **off}
 
 
+def of_link(
+    first: str,
+    later: str,
+    name: str,
+    way: tuple[str, float, float, str],
+    p: float,
+    instead: Sequence[str],
+) -> dict[str, Any]:
+    """A link that moved between two recordings that were fitted as one rig's, in the same form.
+
+    Args:
+        first, later: what the recordings are called.
+        name: of the link.
+        way: its parameter that shows it best; by how much that changed, with its sigma and unit.
+        p: of so large a change by chance.
+        instead: links of which one may have moved in its place.
+    """
+    parameter, change, sigma, unit = way
+    by = f"{parameter} by {'-' if change < 0 else ''}{size_told(abs(change), sigma, unit)}"
+    other = f" (or, in its place, {' or '.join(instead)})" if instead else ""
+    said = (
+        f"between {first} and {later} {name} moved, {by}{other}, and one fit takes it for the "
+        "same; fit each alone, the later with the run of the first as its --prior"
+    )
+    return {
+        **_otherwise("frame", name, later, whole(said)),
+        "recording": later,
+        "size": abs(change),
+        "unit": unit,
+        "sigma": sigma,
+        "axis": parameter,
+        "p_value": at_least(p),
+        "p_adjusted": at_least(p),
+        "indistinguishable_from": list(instead),
+    }
+
+
 def of_part(
     name: str, sources: Sequence[Source], off_m: float, sigma_m: float, p: float
 ) -> dict[str, Any]:

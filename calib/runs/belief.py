@@ -47,7 +47,8 @@ def _misfit(run: Run, kind: str, times: float) -> str:
 def _rings(run: Run, bad: bool) -> list[str]:
     """How rings are numbered otherwise than their LiDAR's model has it."""
     found = run.summary.get("rings", ())
-    return [each["sentence"] for each in found if harmful(each["what"]) == bad]
+    told = (each["sentence"] for each in found if harmful(each["what"]) == bad)
+    return list(dict.fromkeys(told))  # of several recordings the same
 
 
 def over_floor(run: Run) -> float:

@@ -38,6 +38,7 @@ from calib.results.recalibrate import freed
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
+from calib.runs.asked.between import moved_between
 from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -88,6 +89,9 @@ def _found(
     refits = refits and run.summary["rms_mm"]["held_out"] is not None
     refits = refits and run.model["hold_out"] != "none"
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
+    between = list(moved_between(stand, found.looks[-1].stand, progress)) if run.converged else []
+    # What moved once, between two recordings, seems to scatter by chance.
+    found = replace(found, chance=()) if between else found
     result = conclude(
         found,
         falls,
@@ -98,6 +102,7 @@ def _found(
         [
             *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
             *_not_as_drawn(run, found),
+            *between,
         ],
         formulas,
     )

@@ -23,11 +23,11 @@ def keep(recording: Path, locations: tuple[str, ...]) -> None:
         stops.keep([i for i, at in enumerate(stops.columns["location"]) if at in locations])
 
 
-def bump(recording: Path) -> None:
+def bump(recording: Path, by: np.ndarray = BUMP) -> None:
     """Move the LiDAR on its mount: it sees every point from elsewhere."""
 
     def moved(scan: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        points = se3.apply(se3.exp(-BUMP), np.stack([scan[axis] for axis in XYZ], axis=1))
+        points = se3.apply(se3.exp(-by), np.stack([scan[axis] for axis in XYZ], axis=1))
         return scan | dict(zip(XYZ, points.T, strict=True))
 
     Scene(recording, np.random.default_rng()).each_scan(moved)

@@ -22,7 +22,7 @@ from chains.errors import InputError
 from sensors.recording import write_table
 
 from ..mishaps import Scene
-from .bumps import BUMP, bumped
+from .bumps import BUMP, bump, bumped
 
 NAMES, DIM = ("mount", "lidar", "arm", "unseen"), 3
 SIZE = DIM * len(NAMES)
@@ -244,6 +244,24 @@ def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_pa
     )
     assert run.summary["sigmas_widened_by"] == 1.0 and run.summary["misfit"]["cad"] < 1.7
     assert not [each for each in diagnose(run).blunders if each["kind"] == "frame"]
+
+
+@pytest.mark.slow
+def test_what_moved_between_recordings_of_one_fit_is_no_chance(runs, tmp_path):
+    """A LiDAR that sat elsewhere in the second of two seemed to sit anew at every stop."""
+    folder = runs["a"].folder.parent
+    both = [folder / "before", folder / "after"]
+    found = diagnose(calibrate(both, tmp_path / "run", hold_out="none"))
+    (moved,) = found.blunders
+    assert (moved["kind"], moved["name"], moved["recording"]) == ("frame", "lidar", "after")
+    assert moved["axis"] == "rz" and abs(moved["size"] - BUMP[2]) < 4 * moved["sigma"]
+    by = f"{1e3 * moved['size']:.3g} ± {1e3 * moved['sigma']:.2g} mrad"
+    assert found.sentences[0].startswith(f"Between before and after lidar moved, rz by {by}, and")
+    assert not any("random as far as" in each for each in found.sentences)
+    shutil.copytree(folder / "after", tmp_path / "again")
+    bump(tmp_path / "again", -BUMP)
+    found = diagnose(calibrate([both[0], tmp_path / "again"], tmp_path / "same", hold_out="none"))
+    assert not found.blunders
 
 
 @pytest.mark.slow
