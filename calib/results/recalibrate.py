@@ -93,10 +93,10 @@ def as_let_go(prior: JointPrior, links: Iterable[Mapping[str, Any]]) -> JointPri
         prior: that solution.
         links: what became of each, as `summary.json` has it.
     """
-    return prior.loosened(freed(links))
+    return prior.loosened(freedoms(links))
 
 
-def freed(links: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+def freedoms(links: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """By how many of CAD's sigmas a fit let each link go, 0 where it was held, as `summary.json`
     has it. Those of earlier versions let go by one sigma what had moved."""
     return {link["name"]: link.get("freed", float(link["moved"])) for link in links}

@@ -34,7 +34,7 @@ from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.outstanding import moves
-from calib.results.recalibrate import freed
+from calib.results.recalibrate import freedoms
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -371,7 +371,7 @@ def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
 def _moved(run: Run) -> dict[str, float]:
     """Links that a fit from an earlier run found to have moved, or let go in place of one that did:
     CAD is no witness of where they are now."""
-    return {name: times for name, times in freed(run.summary.get("links", ())).items() if times}
+    return {name: times for name, times in freedoms(run.summary.get("links", ())).items() if times}
 
 
 def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ()) -> Stand:
