@@ -45,7 +45,7 @@ class Model:
     fixed: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     beams: int | None = None
-    moved: Mapping[str, float] = field(default_factory=dict)
+    moved: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
