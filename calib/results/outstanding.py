@@ -119,7 +119,7 @@ def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:
-    links = [link for link in summary.get("links", ()) if link["moved"]]
+    links = [link for link in summary.get("links", ()) if link.get("freed", link["moved"])]
     known = {name for link in links for name in (link["name"], *_parameters(link))}
     for name, move in moves(summary).items():
         if move["move_sigmas"] > FAR_FROM_CAD and name not in known:
