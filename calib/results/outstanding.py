@@ -119,15 +119,21 @@ def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:
-    links = [link for link in summary.get("links", ()) if link.get("freed", link["moved"])]
-    known = {name for link in links for name in (link["name"], *_parameters(link))}
+    freed, known = freedoms(summary), set()
+    for link in (link for link in summary.get("links", ()) if link["name"] in freed):
+        known |= {link["name"], *(f"{link['name']}.{p}" for p in link["parameters"])}
     for name, move in moves(summary).items():
         if move["move_sigmas"] > FAR_FROM_CAD and name not in known:
             yield move_told(name, move)
 
 
-def _parameters(link: Mapping[str, Any]) -> list[str]:
-    return [f"{link['name']}.{parameter}" for parameter in link["parameters"]]
+def freedoms(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The links that a fit from an earlier run let go, each with by how many of CAD's sigmas. They
+    moved, or may have in place of one that did, so CAD is no witness of where they are. Earlier
+    versions let go by one sigma what had moved."""
+    links = summary.get("links", ())
+    found = {link["name"]: link.get("freed", float(link["moved"])) for link in links}
+    return {name: times for name, times in found.items() if times}
 
 
 def _told(lines: Iterator[str]) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -32,7 +32,7 @@ FREEDOMS = 2.0 ** np.arange(11)
 # Odds by which one link explains better than another, from which on it is named alone: "strong"
 # evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
 STRONG_ODDS = 20.0
-MOST_FITS = 4  # of one recalibration; two, where moves are small enough to be linear
+MOST_FITS = 4  # of one recalibration: one where nothing moved, two where data stay as they are
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,10 @@ class Link:
 
     Args:
         name: the variable.
-        moved: whether it moved by more than the two uncertainties allow.
+        moved: whether it moved, as chance hardly makes such a change beside all others that moved.
         p_value: of the change, if it had not; None where the new data say nothing of it.
-        change: (n,) now minus then, per parameter, m or rad.
-        sigma: (n,) of the change where it moved, else of the estimate now.
+        change: (n,) now minus then, per parameter, m or rad, if those that moved are the ones.
+        sigma: (n,) of the change where it moved, else of the estimate now; the same holds.
         parameters: (n,) names.
         units: (n,).
         freed: by how many of CAD's sigmas the fit let it go from the earlier value; 0 where held.
@@ -84,22 +84,6 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
             "of the same rig"
         )
     return JointPrior(held, means, solution.covariance[np.ix_(rows, rows)])
-
-
-def as_let_go(prior: JointPrior, links: Iterable[Mapping[str, Any]]) -> JointPrior:
-    """An earlier solution, less sure of those links that had moved.
-
-    Args:
-        prior: that solution.
-        links: what became of each, as `summary.json` has it.
-    """
-    return prior.loosened(freedoms(links))
-
-
-def freedoms(links: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """By how many of CAD's sigmas a fit let each link go, 0 where it was held, as `summary.json`
-    has it. Those of earlier versions let go by one sigma what had moved."""
-    return {link["name"]: link.get("freed", float(link["moved"])) for link in links}
 
 
 class RefittedPrior(NamedTuple):
@@ -172,8 +156,8 @@ def let_go(prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior]) -> lis
     """What became of each link since an earlier solution.
 
     Links that contradict prior and data beyond chance (1 % over all links) are taken to have moved,
-    and the fit is repeated with these let go, until it finds no others. So are links of which one
-    may have moved in their place, as their estimates are no surer.
+    and the fit is repeated with these let go, until one finds what another found before. So are
+    links of which one may have moved in their place, as their estimates are no surer.
 
     Args:
         prior: the earlier solution.
@@ -191,14 +175,19 @@ def let_go(prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior]) -> lis
         if len(fits) == MOST_FITS or any(_alike(found, earlier) for earlier in fits):
             break
         free = found
-    links, held = [], prior.loosened(moved)
+    held = prior.loosened(moved)
+    p_values, now, links = _tests(held, data), data.fitted(held), []
+    for name in moved:
+        p_values[name] = _tests(prior.loosened(_without(moved, name)), data)[name]
     for v in prior.held:
-        others = {n: f for n, f in moved.items() if n != v.name}
-        p_value = _tests(prior.loosened(others), data)[v.name]
-        link = _link(v, held, data.fitted(held), p_value, moved.get(v.name, 0.0))
+        link = _link(v, held, now, p_values[v.name], moved.get(v.name, 0.0))
         alike = tuple(instead.get(v.name, {}))
         links.append(replace(link, freed=fits[-1].get(v.name, 0.0), instead=alike))
     return links
+
+
+def _without(freed: Mapping[str, float], name: str) -> dict[str, float]:
+    return {other: times for other, times in freed.items() if other != name}
 
 
 def _alike(freed: Mapping[str, float], other: Mapping[str, float]) -> bool:
@@ -224,7 +213,7 @@ def _moved(prior: JointPrior, data: NewerData) -> dict[str, float]:
             break
         moved = max((evidence.freest(moved, name) for name in beyond), key=evidence.gain)
         for name in list(moved)[:-1]:
-            others = {n: f for n, f in moved.items() if n != name}
+            others = _without(moved, name)
             p_value = _tests(prior.loosened(others), data)[name]
             moved = moved if p_value is not None and p_value <= limit else others
     return moved
@@ -236,7 +225,7 @@ def _instead(
     """Per link that moved those that explain nearly as much in its place, and how free each is."""
     evidence, found = _Evidence.of(prior, data), {}
     for name in moved:
-        others = {n: f for n, f in moved.items() if n != name}
+        others = _without(moved, name)
         ways = {v.name: evidence.freest(others, v.name) for v in prior.held if v.name not in moved}
         enough = max(evidence.gain(moved) - np.log(STRONG_ODDS), evidence.gain(others))
         found[name] = {n: way[n] for n, way in ways.items() if evidence.gain(way) > enough}

@@ -242,8 +242,8 @@ def _fit(
     summary = _summary(problem, estimate, nominal, seen, unseen)
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
-    let_go = [link.name for link in links or () if link.freed]
-    summary |= {"misfit": misfit(estimate, seen, let_go), "misfit_by": by}
+    released = [link.name for link in links or () if link.freed]
+    summary |= {"misfit": misfit(estimate, seen, released), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}

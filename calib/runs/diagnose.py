@@ -33,8 +33,7 @@ from calib.problem.spread import names_of
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
-from calib.results.outstanding import moves
-from calib.results.recalibrate import freedoms
+from calib.results.outstanding import freedoms, moves
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -368,12 +367,6 @@ def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
     return held_out(stand.sources, stand.model, by, count, progress, stand.estimate.start)
 
 
-def _moved(run: Run) -> dict[str, float]:
-    """Links that a fit from an earlier run found to have moved, or let go in place of one that did:
-    CAD is no witness of where they are now."""
-    return {name: times for name, times in freedoms(run.summary.get("links", ())).items() if times}
-
-
 def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ()) -> Stand:
     """Where a run stands: its model, its recordings, and the state in which its fit was left.
 
@@ -385,7 +378,7 @@ def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ())
     Raises:
         InputError: its recordings are not what they were, or a file of effects is wrong.
     """
-    sources, model = reopened(run), replace(model_of(run), moved=_moved(run))
+    sources, model = reopened(run), replace(model_of(run), moved=freedoms(run.summary))
     own = own_effects([source.rig for source in sources], candidates)
     problem, converged = build(sources, model), run.summary["converged"]
     state_of(run, problem)  # or it would look from elsewhere, unseen

@@ -58,7 +58,7 @@ def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORD
     moved, still, silent = by_what_became(links)
     if moved:
         out = "; ".join(
-            f"{link['name']} {' and '.join(_changes(link, words))}{in_its_place(link)}"
+            f"{link['name']} {' and '.join(_changes(link, words))}{_in_its_place(link)}"
             for link in moved
         )
         out += f"; {words.no_other}" if still else ""
@@ -79,7 +79,7 @@ def by_what_became(links: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str
     return moved, told, [link for link in others if link["p_value"] is None]
 
 
-def in_its_place(link: Mapping[str, Any]) -> str:
+def _in_its_place(link: Mapping[str, Any]) -> str:
     """Which others may have moved and not this one, if any."""
     others = link.get("instead", ())
     if not others:

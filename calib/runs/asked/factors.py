@@ -5,7 +5,8 @@ from __future__ import annotations
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
-from calib.results.recalibrate import as_let_go, earlier
+from calib.results.outstanding import freedoms
+from calib.results.recalibrate import earlier
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate
@@ -43,4 +44,4 @@ def prior_of(run: Run, problem: Problem) -> JointPrior | None:
     """What stood for CAD in a run's fit, less sure of what had moved; None where CAD did."""
     if run.prior is None:
         return None
-    return as_let_go(earlier(problem, Run.open(run.prior).solution), run.summary["links"])
+    return earlier(problem, Run.open(run.prior).solution).loosened(freedoms(run.summary))
