@@ -60,7 +60,7 @@ ROOMS = {
     "sensors.readers": ("tables", "clouds", "poses", "meshes", "arms", "packets", "bags"),
     "calib": (
         *("outputs", "rig", "effects", "forward", "residuals", "problem", "linear", "solve"),
-        *("results", "blunders", "diagnosis"),
+        *("results", "blunders", "diagnosis", "recalibration"),
         *("runs", "planning"),
         *("show", "simulation", "evaluation", "intake", "exporters", "report", "view"),
         "cli",
@@ -69,7 +69,7 @@ ROOMS = {
 # Rooms that know unknowns. What one is says its `Unknown`; its name is made, and not taken apart.
 # Beside them what takes other texts apart: what users type, files, sentences, columns and units.
 KNOWING_UNKNOWNS = ("forward", "residuals", "problem", "linear", "solve", "results", "blunders")
-KNOWING_UNKNOWNS += ("diagnosis", "runs", "planning")
+KNOWING_UNKNOWNS += ("diagnosis", "recalibration", "runs", "planning")
 TEXTS = {
     "calib/blunders/told.py": "directions, in sentences",
     "calib/diagnosis/candidates.py": "families of effects, for a formula",

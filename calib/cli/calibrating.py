@@ -115,8 +115,10 @@ def fit(
         raise InputError(f"--hold-out {hold_out}: give location, stop or none")
     from calib.problem.model import Model
     from calib.runs.calibrate import calibrate
+    from calib.runs.reopen import effects_of_prior
 
-    chosen = Model.of(effects, fix or [], without or [], recordings, beams)
+    known = effects_of_prior(prior) if effects is None else ()
+    chosen = Model.of(effects, fix or [], without or [], recordings, beams, known)
     with executing(workers, scheduler), progress_bar() as progress:
         run = calibrate(recordings, out, chosen, hold_out, folds, prior, progress)
     _tell(run, as_json)

@@ -23,10 +23,11 @@ from calib.problem.model import Source
 from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, columns_at, joint_range, placed
 from calib.rig.columns import stop_columns
-from calib.runs.reopen import model_of, problem_of, reopened, start_of, state_of
+from calib.runs.asked.factors import estimate_of, prior_of
+from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate
-from calib.solve.fit import Progress, shapes_freed, solve
+from calib.solve.fit import Progress, shapes_freed
 from chains import se3
 from chains.errors import InputError
 from sensors.stops import CsvTable, write_columns
@@ -108,10 +109,8 @@ def evaluate_at(
     Raises:
         InputError: the file lacks a joint or a covariate, or no tracked body hangs from the arm.
     """
-    sources = reopened(run)
-    problem, source = problem_of(run, sources), sources[0]
-    state_of(run, problem)
-    estimate = solve(problem, progress=progress, start=start_of(run, sources))
+    estimate = estimate_of(run, progress)
+    problem = estimate.problem
     if body_beyond(problem) is None:
         raise InputError(
             f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "
@@ -123,7 +122,7 @@ def evaluate_at(
             f"is at these poses"
         )
     told = _known(run, estimate, progress)
-    found = _predicted(run, *told, *_read(Path(poses), source))
+    found = _predicted(run, *told, *_read(Path(poses), problem.sources[0]))
     if out is not None:
         if Path(out).suffix != ".csv":
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
@@ -142,8 +141,9 @@ def says_where_the_base_is(problem: Problem) -> bool:
 def _known(run: Run, estimate: Estimate, progress: Progress) -> tuple[Estimate, Intervals]:
     """The estimate with shapes among its unknowns, and the intervals of all, as the run reports
     them."""
-    freed = shapes_freed(estimate, model_of(run))
-    return freed, intervals(freed, progress).at_least(run.summary["sigmas_widened_by"])
+    freed = shapes_freed(estimate, model_of(run), prior_of(run, estimate.problem))
+    wider = run.summary["sigmas_widened_by"], run.summary.get("cad_widened_by", 1.0)
+    return freed, intervals(freed, progress).at_least(*wider)
 
 
 def _predicted(

@@ -29,10 +29,11 @@ from calib.planning.stops import Poses
 from calib.planning.tolerance import purpose_until
 from calib.planning.worth import Known, Pair
 from calib.problem.unknowns import Key
-from calib.results.recalibrate import earlier
 from calib.results.stages import PLAN as STAGES
 from calib.results.stages import staged
+from calib.runs.asked.factors import prior_of
 from calib.runs.diagnose import stand_of
+from calib.runs.reopen import problem_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
 from chains import se3
@@ -383,9 +384,7 @@ def planner_without_places(
         aim = purpose_until(stand, until)
     else:
         aim = purpose_of(fitted, stand, purpose if fitted else purpose or ALL)
-    prior = None
-    if fitted and fitted.prior:
-        prior = earlier(stand.estimate.problem, Run.open(fitted.prior).solution)
+    prior = prior_of(fitted, problem_of(fitted, stand.sources)) if fitted else None
     cameras = stand.sources[0].recording.folder / CAMERAS
     return Planner(
         cameras_m=read_cameras(cameras) if cameras.is_file() else None,

@@ -48,8 +48,7 @@ def build(
     for source, terms in zip(sources, problem.terms, strict=True):
         for term in (t for t in terms if not t.effect.widens):
             unknown = effect_unknown(term, source)
-            wider = np.hypot(1.0, model.moved.get(unknown.name, 0.0))
-            unknown = replace(unknown, sigma=wider * unknown.sigma)
+            unknown = unknown.loosened(model.moved.get(unknown.name, 0.0))
             params = term.effect.params(source.rig)
             problem.add(unknown, np.array([params[i].start for i in term.free], float))
             if unknown.role is Role.CALIBRATION:

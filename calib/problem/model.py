@@ -25,6 +25,7 @@ from sensors.documents import nearest
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
+TIME = "elapsed_s"  # since a recording began
 ROWS_A_PARAMETER = 10  # of an arm, for its whole geometry to be estimated; see `default_effects`
 
 
@@ -61,18 +62,20 @@ class Model:
         without: Sequence[str] = (),
         recordings: Sequence[Path | str] = (),
         beams: int | None = None,
+        known: Sequence[Effect] = (),
     ) -> Model:
         """The model that a command line names: effects with commas, or `default_effects`.
 
         Args:
             chosen, fixed, without, beams: as the command line has them.
             recordings: to be fitted; effects that their ``rig.yaml`` names go by their names here.
+            known: effects that are known of the rig, see `default_effects`.
 
         Raises:
             InputError: an effect that there is not, in the catalogue or in a file.
         """
         if chosen is None:
-            named = default_effects(recordings)
+            named = default_effects(recordings, known)
         else:
             whole = all(map(effects.is_known, effects.split(chosen)))
             there = [r for r in recordings if not whole and (remote.here(r) / "rig.yaml").is_file()]
@@ -212,8 +215,13 @@ class Model:
                 )
 
 
-def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
+def default_effects(
+    recordings: Sequence[Path | str], known: Sequence[Effect] = ()
+) -> tuple[str | Effect, ...]:
     """The effects that are estimated where none are chosen.
+
+    What is known of the rig is among them: without an effect that it has, others would have to
+    explain what that did. What goes with time is of the day, and not of the rig.
 
     Without the arm's whole geometry the sigmas of its lengths and zeros are too small, so it is
     there wherever the tracked poses can tell it: from ten rows on for each parameter of the arm
@@ -235,7 +243,9 @@ def default_effects(recordings: Sequence[Path | str]) -> tuple[str, ...]:
             arm = [effects.find(name) for name in effects.GEOMETRY]
             most = max(most, sum(p.sigma > 0 for effect in arm for p in effect.params(rig)))
     told = 0 < ROWS_A_PARAMETER * most <= rows
-    return (*effects.DEFAULT, *(n for n in effects.GEOMETRY if told and n not in effects.DEFAULT))
+    usual = (*effects.DEFAULT, *(n for n in effects.GEOMETRY if told and n not in effects.DEFAULT))
+    lasting = (effect for effect in known if TIME not in effect.covariates)
+    return (*usual, *(effect for effect in lasting if effect.name not in usual))
 
 
 def owned(effect: Effect, rig: Rig) -> bool:

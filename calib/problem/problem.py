@@ -153,6 +153,11 @@ class Problem:
             self.initial[unknown.name] = unknown.mean if value is None else value
         return unknown.name
 
+    def loosened(self, moved: Mapping[str, float]) -> Problem:
+        """The problem where unknowns have moved since CAD told of them; see `Model.moved`."""
+        known = self.variables.items()
+        return replace(self, variables={n: u.loosened(moved.get(n, 0.0)) for n, u in known})
+
     def with_cells(self, unknowns: Sequence[Unknown], cells: Mapping[str, SurfaceCells]) -> Problem:
         """The problem with unknowns of its surfaces; its scans know which of these moves what."""
         numbers = {name: CellNumbers.of(some.column, some.parts) for name, some in cells.items()}

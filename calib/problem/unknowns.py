@@ -131,6 +131,10 @@ class Unknown:
         sigma[mine] = np.sqrt(sigma[mine] ** 2 - self.scatter.get(unit, 0.0) ** 2 + sd**2)
         return replace(self, sigma=sigma, scatter={**self.scatter, unit: sd})
 
+    def loosened(self, by: float) -> Unknown:
+        """The same, where it may have moved by as many of its sigmas since that was known."""
+        return replace(self, sigma=np.hypot(1.0, by) * self.sigma)
+
     def moved(self, value: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A value after a step (dim,) of its tangent: ``T exp(step)``, ``x + step``."""
         return value @ se3.exp(step) if self.kind == "pose" else value + step

@@ -14,6 +14,7 @@ from calib.forward import Values
 from calib.linear.parallel import over_stops
 from calib.problem import Problem
 from calib.problem.model import Source, same_mesh
+from calib.recalibration.links import moved_since_cad
 from calib.report.budget import Budget, budget
 from calib.report.statistics import (
     AZIMUTHS,
@@ -31,13 +32,14 @@ from calib.report.statistics import (
 )
 from calib.report.walls import Box, Ends, Face, faces, yaw_of
 from calib.residuals.scan import ScanStop
+from calib.runs.asked.factors import estimate_of
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.runs.ladder import Rung, ladder
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.residual_table import UNSEEN_FOLDER, beam_ends, residual_table, table_path
 from calib.runs.run import RESIDUALS, SUMMARY, Run
 from calib.solve.estimate import Estimate, Start, values_of
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress
 from chains import se3
 from chains.errors import InputError
 from sensors.recording import read_table
@@ -125,13 +127,15 @@ class Evidence:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """The fit once more, from where it was left."""
-        return solve(self.problem, progress=self.progress, start=self.start)
+        """The fit, as it was left."""
+        return estimate_of(self.run, self.progress)
 
     @cached_property
     def prior_sigma(self) -> dict[str, float]:
-        """``variable.parameter`` of the calibration -> how sure CAD was of it, rad or m."""
-        variables = (self.problem.variables[name] for name in self.problem.calibration)
+        """``variable.parameter`` of the calibration -> how sure CAD was of it, rad or m; less sure
+        where it has moved since."""
+        known = self.problem.loosened(moved_since_cad(self.run.summary)).variables
+        variables = (known[name] for name in self.problem.calibration)
         return {
             f"{v.name}.{dof}": float(s)
             for v in variables

@@ -288,7 +288,7 @@ def _of_body(block: TrackedBody, squares: np.ndarray, expected: np.ndarray) -> E
 
 
 def misfit(
-    estimate: Estimate, beams: Errors, moved: Collection[str] = (), weighted: bool = False
+    estimate: Estimate, beams: Errors, elsewhere: Collection[str] = (), weighted: bool = False
 ) -> dict[str, float]:
     """How many times larger than their sigmas allow the residuals are, by kind of instrument.
 
@@ -302,7 +302,7 @@ def misfit(
     Args:
         estimate: the solution.
         beams: of all scans, as fitted.
-        moved: frames that are known to have moved since CAD told of them.
+        elsewhere: frames of whose places something other than CAD tells.
         weighted: whether groups of rows that are further off than chance puts one, and whose pull
             is bounded by a robust weight, are left out: what is left tells how right sigmas are. Of
             CAD, which has few, they count with their weight.
@@ -323,7 +323,7 @@ def misfit(
     if surfaces:
         worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
         out["reference"] = float(np.sqrt(worst))
-    return out | _of_cad(estimate, moved, weighted)
+    return out | _of_cad(estimate, elsewhere, weighted)
 
 
 def _of_blocks(
@@ -376,9 +376,9 @@ def in_cad(problem: Problem) -> frozenset[str]:
     return frozenset(t.variable for t in terms if isinstance(t.effect, FrameOffset))
 
 
-def _of_cad(estimate: Estimate, moved: Collection[str], weighted: bool) -> dict[str, float]:
+def _of_cad(estimate: Estimate, elsewhere: Collection[str], weighted: bool) -> dict[str, float]:
     """Of the places that frames have in CAD, as far as others contradict them (Birge 1932)."""
-    frames = in_cad(estimate.problem) - set(moved)
+    frames = in_cad(estimate.problem) - set(elsewhere)
     start = np.cumsum([0, *(u.dim for u in estimate.variables)])
     variance = np.diag(estimate.covariance)
     chi2 = left = 0.0
@@ -387,7 +387,7 @@ def _of_cad(estimate: Estimate, moved: Collection[str], weighted: bool) -> dict[
             weight = unknown.weight if weighted else 1.0
             chi2 += weight * _prior_cost(unknown, estimate.values[unknown.name])
             told = variance[first : first + unknown.dim] / np.square(unknown.sigma)
-            left += float(np.sum(1.0 - weight * told))
+            left += float(np.sum(np.maximum(1.0 - weight * told, 0.0)))
     return {CAD: float(np.sqrt(chi2 / left))} if left > CHECKED else {}
 
 

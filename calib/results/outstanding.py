@@ -119,21 +119,9 @@ def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:
-    freed, known = freedoms(summary), set()
-    for link in (link for link in summary.get("links", ()) if link["name"] in freed):
-        known |= {link["name"], *(f"{link['name']}.{p}" for p in link["parameters"])}
     for name, move in moves(summary).items():
-        if move["move_sigmas"] > FAR_FROM_CAD and name not in known:
+        if move["move_sigmas"] > FAR_FROM_CAD:
             yield move_told(name, move)
-
-
-def freedoms(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The links that a fit from an earlier run let go, each with by how many of CAD's sigmas. They
-    moved, or may have in place of one that did, so CAD is no witness of where they are. Earlier
-    versions let go by one sigma what had moved."""
-    links = summary.get("links", ())
-    found = {link["name"]: link.get("freed", float(link["moved"])) for link in links}
-    return {name: times for name, times in found.items() if times}
 
 
 def _told(lines: Iterator[str]) -> list[str]:

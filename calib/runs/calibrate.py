@@ -14,7 +14,6 @@ import numpy as np
 
 from calib import outputs
 from calib import problem as problems
-from calib.blunders.chance import at_least
 from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
 from calib.forward import Values
@@ -23,6 +22,9 @@ from calib.outputs.journal import going_on
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
+from calib.recalibration.links import Link, moved_since_cad, since
+from calib.recalibration.prior import earlier
+from calib.recalibration.refit import solve_from
 from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
 from calib.results.errors import (
@@ -41,12 +43,19 @@ from calib.results.misfit import (
     redundancies,
 )
 from calib.results.reach import reach
-from calib.results.recalibrate import Link, earlier, solve_from
 from calib.results.rings import documents as odd_rings
 from calib.results.solution import solution_of, up_of, zeros_of
 from calib.results.stages import FIT, staged
 from calib.runs.belief import TOLERATED, limits
-from calib.runs.reopen import identity, model_of, proposed, reopened, start_of, stored_met
+from calib.runs.reopen import (
+    effects_of_prior,
+    identity,
+    model_of,
+    proposed,
+    reopened,
+    start_of,
+    stored_met,
+)
 from calib.runs.residual_table import (
     UNSEEN_FOLDER,
     residual_bytes,
@@ -89,7 +98,7 @@ def calibrate(
     Args:
         recordings: folder, or folders; what is the same hardware is one variable.
         out: the run folder to make; an earlier run there is replaced, anything else is refused.
-        model: what is estimated; the default effects where None.
+        model: what is estimated; where None the default effects, and those of `prior`.
         hold_out: "location", "stop" or "none": what the held-out error leaves out of its fit.
         folds: how many folds of about a fifth each the held-out error is taken over.
         prior: an earlier run, whose solution replaces CAD as what is known before.
@@ -102,7 +111,7 @@ def calibrate(
     inputs = [*recordings, *([prior] if prior else [])]
     with outputs.folder(out, outputs.RUN, inputs) as folder:
         _refuse_twice([r.resolve() for r in recordings])
-        model = model or Model.of(None, (), (), recordings)
+        model = model or Model.of(None, (), (), recordings, known=effects_of_prior(prior))
         opened = [Source.open(r).of_beams(model.beams) for r in recordings]
         sources, model = placed(leave_out(opened, model.without), model)
         choices = _Choices(Path(out), hold_out, folds, prior)
@@ -209,15 +218,15 @@ def _fit(
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
     began, progress = time.monotonic(), staged(progress, FIT)
-    before = Run.open(choices.prior).solution if choices.prior else None
+    before = Run.open(choices.prior) if choices.prior else None
     problem = problems.build(sources, model)
-    links: list[Link] | None = None
-    if before is None:
+    held = earlier(problem, before.solution) if before else None
+    links: list[Link] = []
+    if held is None:
         estimate = solve(problem, progress=progress, start=start)
         freed = shapes_freed(estimate, model)  # the same where no effect has a shape
         known = intervals(freed, progress)
     else:
-        held = earlier(problem, before)
         estimate, freed, known, links = solve_from(problem, model, held, progress)
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
     nominal = _nominal(problem, progress)
@@ -227,10 +236,10 @@ def _fit(
     if not estimate.scans:
         seen = body_errors(problem.bodies, estimate.values, None)
     _refuse_nothing(problem, seen)
-    bulk = misfit(estimate, seen, weighted=True)  # one wild row widens no sigma
+    elsewhere = held.variables if held else ()  # an earlier run stands in place of CAD
+    bulk = misfit(estimate, seen, elsewhere, weighted=True)  # one wild row widens no sigma
     large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
-    of_cad = large.pop(CAD, 1.0)
-    cad = of_cad if before is None else 1.0  # else an earlier run stands in place of CAD
+    cad = large.pop(CAD, 1.0)
     widened = max([1.0, *large.values()])
     known = known.at_least(widened, cad)
     calibration = known.of([v.name for v in estimate.variables])
@@ -241,9 +250,10 @@ def _fit(
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
-    by = {**misfit_by(estimate, rows, by_stop), "limit": limits(redundancies(rows))}
-    released = [link.name for link in links or () if link.freed]
-    summary |= {"misfit": misfit(estimate, seen, released), "misfit_by": by}
+    summary |= since(links, before.summary) if before else {}
+    judged = estimate.loosened(moved_since_cad(summary))
+    by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
+    summary |= {"misfit": misfit(judged, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
     summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
@@ -254,7 +264,6 @@ def _fit(
     summary |= {"up": up} if (up := up_of(estimate, widened)) else {}
     summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, widened)) else {}
     summary["seconds"] = time.monotonic() - began
-    summary |= {} if links is None else {"links": [link_document(link) for link in links]}
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
@@ -380,18 +389,3 @@ def _steps(below: Run) -> list[dict[str, Any]] | None:
     one of these did not write them down."""
     lower = below.model.get("steps", None if below.grown_from else [])
     return None if lower is None else [*lower, model_of(below).document()]
-
-
-def link_document(link: Link) -> dict[str, Any]:
-    """What became of a link, as summary.json holds it."""
-    return {
-        "name": link.name,
-        "moved": link.moved,
-        "p_value": None if link.p_value is None else at_least(link.p_value),
-        "parameters": link.parameters,
-        "units": link.units,
-        "change": link.change,
-        "sigma": link.sigma,
-        "freed": link.freed,
-        "instead": link.instead,
-    }

@@ -30,14 +30,15 @@ from calib.linear.parallel import one_blas_thread
 from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
+from calib.recalibration.between import moved_between
+from calib.recalibration.links import moved_since_cad
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
-from calib.results.outstanding import freedoms, moves
+from calib.results.outstanding import moves
 from calib.results.rings import harmful, odd_rings
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
-from calib.runs.asked.between import moved_between
 from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -328,7 +329,7 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
         new = without[-2 * len(tokens) :]
         return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *run.trusting])
-    usual = default_effects(run.recordings)
+    usual = None if run.prior else default_effects(run.recordings)
     chosen = [] if tuple(effects) == usual else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
     for key, as_a_rule in (("hold_out", "location"), ("folds", 1)):
@@ -378,7 +379,7 @@ def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ())
     Raises:
         InputError: its recordings are not what they were, or a file of effects is wrong.
     """
-    sources, model = reopened(run), replace(model_of(run), moved=freedoms(run.summary))
+    sources, model = reopened(run), replace(model_of(run), moved=moved_since_cad(run.summary))
     own = own_effects([source.rig for source in sources], candidates)
     problem, converged = build(sources, model), run.summary["converged"]
     state_of(run, problem)  # or it would look from elsewhere, unseen

@@ -47,6 +47,21 @@ def identity(run: Run) -> dict[str, Any]:
     }
 
 
+def effects_of_prior(folder: Path | str | None) -> Sequence[Effect]:
+    """The effects of an earlier run that another is fitted from, for its usual model; none where
+    there is no such run.
+
+    Raises:
+        InputError: one is of a Python file, which does not run unasked.
+    """
+    if folder is None:
+        return ()
+    found, why = effects_that_may_run(Run.open(folder))
+    if why:
+        raise InputError(f"--prior {folder}: {why}; or choose what is estimated with --effects")
+    return found
+
+
 def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
     """Effects of a run's model but those of Python files that the user did not say may run, and
     the sentence that says which these are; empty where there is none."""

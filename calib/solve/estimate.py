@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -89,6 +89,13 @@ class Estimate:
     def cost(self) -> float:
         """Half the weighted chi-square, priors included."""
         return cost_of(self.linear, self.graph, self.values)
+
+    def loosened(self, moved: Mapping[str, float]) -> Estimate:
+        """The same estimate, as it is held against CAD where unknowns have moved since that told
+        of them; see `Model.moved`."""
+        problem = self.problem.loosened(moved)
+        variables = tuple(problem.variables[v.name] for v in self.variables)
+        return replace(self, problem=problem, variables=variables)
 
     def handed_out(self) -> FactorGraph:
         """The graph at the optimum, as GTSAM has it."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.spatial import Delaunay
 
 from calib.evaluation.arm import Arm
 from calib.evaluation.at_poses import evaluate_at, over_workspace
+from calib.problem.model import Model, default_effects
 from calib.report.charts.bodies import workspace
 from calib.report.evidence import Evidence
 from calib.runs.calibrate import calibrate
@@ -37,6 +39,23 @@ def write(table, source, joints):
         rows = csv.writer(file)
         rows.writerow(["stop", *source.rig.joint_names])
         rows.writerows([f"p{k}", *row] for k, row in enumerate(joints.tolist()))
+
+
+def test_what_an_earlier_run_knew_is_known_of_any_pose(world, tmp_path):
+    """It has the effects of that run, and predicts as its own solution has it, not one refitted."""
+    world, before, _, table = world
+    shutil.copytree(before.recordings[0], tmp_path / "few")
+    opened(tmp_path / "few", world, np.random.default_rng(4), poses=12)
+    known = calibrate([tmp_path / "few"], tmp_path / "known", hold_out="none", prior=before.folder)
+    assert set(default_effects([tmp_path / "few"])) < set(known.effects) == set(before.effects)
+    alone = calibrate([tmp_path / "few"], tmp_path / "alone", Model(before.effects), "none")
+    found, first, plain = (evaluate_at(run, table) for run in (known, before, alone))
+    sigma = {
+        id(each): np.sqrt(np.trace(each.covariance[:, 3:, 3:], axis1=1, axis2=2)).max()
+        for each in (found, plain)
+    }
+    assert sigma[id(found)] < 0.6 * sigma[id(plain)]
+    assert np.abs(found.error - first.error)[:, 3:].max() < 4.0 * sigma[id(found)]
 
 
 def test_the_true_place_is_predicted_within_its_sigma(world, tmp_path):

@@ -10,9 +10,11 @@ from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Key, Unknown
-from calib.results.recalibrate import RefittedPrior, let_go
+from calib.recalibration.letgo import let_go
+from calib.recalibration.newer import RefittedPrior
 from calib.runs.asked.moved import _apart, _differences, moved
 from calib.runs.asked.pair import Covariances, Pair, unknowns_of
+from calib.runs.belief import cautions, forbids
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
@@ -22,7 +24,7 @@ from chains.errors import InputError
 from sensors.recording import write_table
 
 from ..mishaps import Scene
-from .bumps import BUMP, bump, bumped
+from .bumps import BUMP, bump, bumped, keep
 
 NAMES, DIM = ("mount", "lidar", "arm", "unseen"), 3
 SIZE = DIM * len(NAMES)
@@ -244,6 +246,17 @@ def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_pa
     )
     assert run.summary["sigmas_widened_by"] == 1.0 and run.summary["misfit"]["cad"] < 1.7
     assert not [each for each in diagnose(run).blunders if each["kind"] == "frame"]
+    # A week later all is where it was; CAD tells no better of what moved before.
+    shutil.copytree(tmp_path / "after", tmp_path / "week")
+    keep(tmp_path / "after", ("L03", "L04"))
+    keep(tmp_path / "week", ("L05",))
+    first, later = tmp_path / "first", tmp_path / "later"
+    calibrate([tmp_path / "after"], first, hold_out="none", prior=runs["a"].folder)
+    run = calibrate([tmp_path / "week"], later, hold_out="none", prior=first)
+    assert not any(link["moved"] for link in run.summary["links"])
+    assert set(run.summary["moved_since_cad"]) >= alike and run.summary["misfit"]["cad"] < 1.7
+    assert not forbids(run) and not any("from CAD" in each for each in cautions(run))
+    assert not diagnose(run).blunders
 
 
 @pytest.mark.slow

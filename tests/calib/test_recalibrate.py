@@ -11,11 +11,12 @@ from scipy.stats import kstest
 from calib.problem.model import Model
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown, pose_unknown
-from calib.results import recalibrate
+from calib.recalibration import refit
+from calib.recalibration.letgo import let_go
+from calib.recalibration.links import freedoms
+from calib.recalibration.newer import NewerData
+from calib.recalibration.prior import change as change_of
 from calib.results.intervals import Intervals
-from calib.results.outstanding import freedoms
-from calib.results.recalibrate import NewerData, let_go
-from calib.runs.calibrate import link_document
 from chains import se3
 
 NAMES = ("mount", "lidar", "arm", "unseen")
@@ -87,15 +88,13 @@ def world(monkeypatch):
                 information=information,
             )
 
-        monkeypatch.setattr(recalibrate, "solve", solve)
+        monkeypatch.setattr(refit, "solve", solve)
         known = as_the_graph_has_them if noise == 1.0 else as_the_rows_have_them
-        monkeypatch.setattr(recalibrate, "intervals", known)
-        monkeypatch.setattr(recalibrate, "shapes_freed", lambda estimate, *_: estimate)
+        monkeypatch.setattr(refit, "intervals", known)
+        monkeypatch.setattr(refit, "shapes_freed", lambda estimate, *_: estimate)
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
-        return {
-            link.name: link for link in recalibrate.solve_from(problem, Model(), prior, None)[-1]
-        }
+        return {link.name: link for link in refit.solve_from(problem, Model(), prior, None)[-1]}
 
     return at
 
@@ -126,7 +125,7 @@ def test_what_moved_is_found_and_its_move_has_an_honest_sigma(world):
     assert draws[0]["arm"].sigma.max() < 0.1
 
 
-@pytest.mark.parametrize("size", [0.5, 2.0, 8.0])  # of CAD's sigmas
+@pytest.mark.parametrize("size", [0.08, 0.5, 2.0, 8.0])  # of CAD's sigmas
 def test_of_links_seen_only_together_either_may_have_moved(world, size):
     """However far: what CAD says of one does not make the other move as well."""
     moved = np.zeros(SIZE)
@@ -141,15 +140,16 @@ def test_of_links_seen_only_together_either_may_have_moved(world, size):
     assert min(links[name].freed for name in (one, other)) >= max(1.0, size / 4)
 
 
+@pytest.mark.parametrize("noise", [1.0, 2.0])
 @pytest.mark.parametrize("size", [3.0, 10.0, 40.0])
-def test_a_link_that_moved_further_than_cad_allows_is_named_alone(world, size):
+def test_a_link_that_moved_further_than_cad_allows_is_named_alone(world, size, noise):
     moved = np.zeros(SIZE)
     moved[2 * DIM] = size
-    links = world(moved)
+    links = world(moved, noise)
     assert [n for n in NAMES if links[n].moved] == ["arm"] and links["arm"].instead == ()
     off = (links["arm"].change - moved[2 * DIM : 3 * DIM]) / links["arm"].sigma
     assert np.abs(off).max() < 4.0
-    assert links["arm"].freed == pytest.approx(size / np.sqrt(DIM), rel=1.0)
+    assert abs(np.log2(links["arm"].freed * np.sqrt(DIM) / size)) <= 1.0
 
 
 def test_a_link_that_cad_holds_too_well_did_not_move():
@@ -175,7 +175,7 @@ def test_what_was_let_go_is_let_go_again(world):
     """As the factor graph of a run that was fitted from another has it."""
     moved = np.zeros(SIZE)
     moved[2 * DIM] = 10.0
-    links = [link_document(link) for link in world(moved).values()]
+    links = [link.document() for link in world(moved).values()]
     prior = JointPrior([linked(n, np.ones(DIM)) for n in NAMES], {}, np.eye(SIZE))
     freed = prior.loosened(freedoms({"links": links})).covariance - np.eye(SIZE)
     assert freed[2 * DIM, 2 * DIM] == links[2]["freed"] ** 2 > 9.0
@@ -196,8 +196,29 @@ def test_a_frame_that_is_turned_far_has_other_axes():
     prior = JointPrior([faro, linked("mount", np.ones(2))], {"faro": then, "mount": 0.0}, np.eye(8))
 
     def change(step):
-        values = {"faro": now @ se3.exp(step[:6]), "mount": step[6:]}
-        return recalibrate._change(prior, SimpleNamespace(values=values))
+        return change_of(prior, {"faro": now @ se3.exp(step[:6]), "mount": step[6:]})
 
     by_differences = [(change(x)[0] - change(-x)[0]) / 2e-6 for x in 1e-6 * np.eye(8)]
     assert change(np.zeros(8))[1] == pytest.approx(np.transpose(by_differences), abs=1e-7)
+
+
+def test_of_links_that_are_found_in_turn_both_are_let_go():
+    """Where the data seem to change with what is let go, as where beams meet other surfaces."""
+    links = [linked(n, np.ones(1)) for n in ("one", "other")]
+    prior = JointPrior(links, {}, 1e-4 * np.eye(2))
+    at = {(): [1.0, 0.0], ("one",): [0.0, 1.0], ("other",): [1.0, 0.0]}
+    asked = []
+
+    def fit(held):
+        free = tuple(
+            v.name for v, s in zip(links, np.diag(held.covariance), strict=True) if s > 0.1
+        )
+        asked.append(free)
+        data = NewerData(
+            1e6 * np.eye(2), 1e6 * np.array(at.get(free, [1.0, 1.0])), np.zeros((2, 2))
+        )
+        return data.fitted(held)
+
+    found = let_go(prior, fit)
+    assert asked == [(), ("one",), ("other",), ("one", "other")]
+    assert all(link.freed for link in found if link.moved)

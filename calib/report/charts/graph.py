@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib.problem.unknowns import Role, Unknown
+from calib.recalibration.newer import blocks_of
 from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence
-from calib.results.recalibrate import blocks_of
 from calib.runs.asked.factors import estimate_of
 from calib.solve.estimate import Estimate
 from calib.solve.without import RowsOfKind, kinds_of

@@ -5,8 +5,8 @@ from __future__ import annotations
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
-from calib.results.outstanding import freedoms
-from calib.results.recalibrate import earlier
+from calib.recalibration.links import freedoms
+from calib.recalibration.prior import earlier
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate

@@ -23,9 +23,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.problem.prior import JointPrior
-from calib.results.recalibrate import ALARM, Link, NewerData, blocks_of, let_go
+from calib.recalibration.letgo import ALARM, let_go
+from calib.recalibration.links import Link
+from calib.recalibration.newer import NewerData, blocks_of
+from calib.recalibration.prior import change
 from calib.runs.asked.pair import Covariances, Pair
-from calib.runs.calibrate import link_document
 from calib.runs.run import Run, solution_digest
 from calib.solve.descent import LAST
 from chains.errors import InputError
@@ -103,7 +105,7 @@ def moved(a: Run, b: Run) -> Moved:
 
 
 def _documents(links: Sequence[Link]) -> list[dict[str, Any]]:
-    return [link_document(link) for link in links]
+    return [link.document() for link in links]
 
 
 # ------------------------------------------------------------------------- how two runs go together
@@ -189,7 +191,10 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     poses = np.concatenate([np.full(u.dim, u.kind == "pose") for u in pair.held])
     cad = np.where(poses, 0.0, 1.0)  # of a pose next to nothing was known
     then = [np.zeros(u.dim) if u.kind == "pose" else pair.then[u.name] for u in pair.held]
-    graph, reported = pair.second.graph / scale, pair.second.reported / scale
+    prior = JointPrior(pair.held, pair.then, pair.first.reported)
+    _, turned = change(prior, pair.now)
+    about_then = (turned @ each @ turned.T for each in (pair.second.graph, pair.second.reported))
+    graph, reported = (each / scale for each in about_then)
     weight = np.linalg.inv(graph)
     information = _nowhere_negative(weight - np.diag(cad))
     force = weight @ (pair.change / sigma) + cad * np.concatenate(then) / sigma
@@ -198,7 +203,7 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     beyond = _nowhere_negative(weight @ (reported - graph) @ weight - np.diag(of_cad))
 
     data = NewerData(information / scale, force / sigma, beyond / scale)
-    return let_go(JointPrior(pair.held, pair.then, pair.first.reported), data.fitted)
+    return let_go(prior, data.fitted)
 
 
 def _nowhere_negative(matrix: np.ndarray) -> np.ndarray:

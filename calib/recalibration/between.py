@@ -1,0 +1,79 @@
+"""What moved between recordings that one fit takes for the same rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from calib.blunders import told
+from calib.diagnosis.stand import Stand
+from calib.problem import build
+from calib.problem.model import Model, Source, labels
+from calib.recalibration.letgo import ALARM
+from calib.recalibration.links import Link
+from calib.recalibration.prior import earlier
+from calib.recalibration.refit import solve_from
+from calib.results.intervals import intervals
+from calib.results.solution import Solution, solution_of
+from calib.solve.fit import Progress, solve
+from chains.errors import InputError
+
+
+def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dict[str, Any]]:
+    """The links that moved between the first recording of a rig and a later one, as blunders of
+    `diagnosis.json`: as a fit of the later one, with that of the first as its prior, finds them.
+
+    Args:
+        stand: a model, fitted to all recordings.
+        last: with what it was found to lack. What scatters by chance is none of that here: a link
+            that moved once seems to.
+        progress: as of `calib.solve.fit.solve`.
+    """
+    chance = {e.name for e in last.model.effects if e.by_chance} - set(stand.model.names)
+    model = last.model.minus(list(chance))
+    named = dict(zip(labels(last.sources), last.sources, strict=True))
+    of_rigs: dict[str, list[str]] = {}
+    for label, source in named.items():
+        of_rigs.setdefault(source.rig.name, []).append(label)
+    alarm = ALARM / max(1, len(named) - len(of_rigs))
+    for rig, (first, *later) in of_rigs.items():
+        known = _alone(model, named[first], progress) if later else None
+        for label in later if known else ():
+            for link in _since(known, model, named[label], alarm, progress):
+                yield _told(first, label, link, f"{rig}/" if len(of_rigs) > 1 else "")
+
+
+def _told(first: str, later: str, link: Link, rig: str) -> dict[str, Any]:
+    """As a blunder, by the parameter that shows it best."""
+    best = int(np.argmax(np.abs(link.change) / link.sigma))
+    way = link.parameters[best], link.change[best], link.sigma[best], link.units[best]
+    instead = [f"{rig}{name}" for name in link.instead]
+    return told.of_link(first, later, f"{rig}{link.name}", way, p=link.p_value, instead=instead)
+
+
+def _alone(model: Model, source: Source, progress: Progress) -> Solution | None:
+    """What one recording alone knows; None where it has nothing to start from, lacks what an effect
+    needs, or its fit comes to no optimum."""
+    try:
+        problem = build([source], model)
+        estimate = solve(problem, progress=progress)
+    except InputError:
+        return None
+    known = intervals(estimate, progress)
+    return solution_of(problem, estimate, known) if estimate.converged else None
+
+
+def _since(
+    known: Solution, model: Model, source: Source, alarm: float, progress: Progress
+) -> list[Link]:
+    """The links that moved from what was known to a recording; none where that alone cannot be
+    fitted; arguments as of `let_go`."""
+    try:
+        problem = build([source], model)
+        prior = earlier(problem, known)
+        estimate, _, _, links = solve_from(problem, model, prior, progress, alarm)
+    except InputError:
+        return []
+    return [link for link in links if link.moved] if estimate.converged else []

@@ -1,0 +1,156 @@
+"""Which links are let go, as they moved since an earlier run, or may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
+from calib.recalibration.links import Link
+from calib.recalibration.newer import NewerData, RefittedPrior, blocks_of, tests
+from calib.recalibration.odds import MoveOdds
+
+ALARM = 0.01  # chance that anything is called moved when nothing has
+# Odds by which one link explains better than another, from which on it is named alone: "strong"
+# evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
+STRONG_ODDS = 20.0
+MOST_FITS = 4  # of one recalibration: one where nothing moved, two where data stay as they are
+
+
+def let_go(
+    prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior], alarm: float = ALARM
+) -> list[Link]:
+    """What became of each link since an earlier solution.
+
+    Links that contradict prior and data beyond chance are taken to have moved, and the fit is
+    repeated with these let go, until one finds what it let go. So are links of which one may have
+    moved in their place, as their estimates are no surer. Where fits find in turn what another let
+    go, the last lets go what any two of them did.
+
+    Args:
+        prior: the earlier solution.
+        fit: from it, or from the same where links were let go, to the newer data.
+        alarm: chance that any link is called moved where none has.
+    """
+    limit = alarm / len(prior.held)
+    fits: list[dict[str, float]] = []
+    free: dict[str, float] = {}
+    last = False
+    while True:
+        held = prior.loosened(free)
+        data = NewerData.of(held, fit(held))
+        moved = _moved(prior, data, limit)
+        instead = _instead(prior, data, moved, limit)
+        found = {n: f for each in instead.values() for n, f in each.items()} | moved
+        if last or _alike(found, free):
+            break
+        fits.append(free)
+        last = len(fits) == MOST_FITS - 1 or any(_alike(found, earlier) for earlier in fits)
+        both = {n: max(found.get(n, 0.0), free.get(n, 0.0)) for n in found | free}
+        free = both if last else found
+    held = prior.loosened(moved)
+    p_values, now, links = tests(held, data), data.fitted(held), []
+    for name in moved:
+        p_values[name] = tests(prior.loosened(_without(moved, name)), data)[name]
+    for v in prior.held:
+        link = _link(v, held, now, p_values[v.name], moved.get(v.name, 0.0))
+        alike = tuple(instead.get(v.name, {}))
+        links.append(replace(link, freed=free.get(v.name, 0.0), instead=alike))
+    return links
+
+
+def _without(freed: Mapping[str, float], name: str) -> dict[str, float]:
+    return {other: times for other, times in freed.items() if other != name}
+
+
+def _alike(freed: Mapping[str, float], other: Mapping[str, float]) -> bool:
+    """Whether the same links are let go, each within a step of the grid."""
+    return freed.keys() == other.keys() and all(
+        abs(np.log2(f / other[name])) <= 1.0 for name, f in freed.items()
+    )
+
+
+def _moved(prior: JointPrior, data: NewerData, limit: float) -> dict[str, float]:
+    """The links that moved, each with by how many of CAD's sigmas it may have.
+
+    Of those beyond chance beside the ones that moved already, the next is that with the greatest
+    evidence. Any that is not beyond chance beside all others did not move.
+
+    Args:
+        prior, data: what was known, and the newer data.
+        limit: p-value of a link from which on it is beyond chance.
+    """
+    moved: dict[str, float] = {}
+    odds = MoveOdds.of(prior, data)
+    for _ in range(2 * len(prior.held)):
+        beyond = _beyond(prior.loosened(moved), data, limit)
+        ways = [odds.freest(moved, name) for name in beyond if name not in moved]
+        if not ways:
+            break
+        moved = max(ways, key=odds.gain)
+        for name in list(moved)[:-1]:
+            others = _without(moved, name)
+            moved = moved if name in _beyond(prior.loosened(others), data, limit) else others
+    return moved
+
+
+def _instead(
+    prior: JointPrior, data: NewerData, moved: Mapping[str, float], limit: float
+) -> dict[str, dict[str, float]]:
+    """Per link that moved those that explain nearly as much in its place, and how free each is;
+    arguments as of `_moved`."""
+    odds, found = MoveOdds.of(prior, data), {}
+    for name in moved:
+        others, enough = _without(moved, name), odds.gain(moved) - np.log(STRONG_ODDS)
+        beyond = _beyond(prior.loosened(others), data, STRONG_ODDS * limit)
+        ways = {n: odds.freest(others, n) for n in beyond if n not in moved}
+        found[name] = {n: way[n] for n, way in ways.items() if odds.gain(way) > enough}
+    return found
+
+
+def _beyond(prior: JointPrior, data: NewerData, limit: float) -> list[str]:
+    """The links whose change is beyond chance."""
+    return [name for name, p in tests(prior, data).items() if p is not None and p <= limit]
+
+
+def _link(
+    variable: Unknown,
+    prior: JointPrior,
+    now: RefittedPrior,
+    p_value: float | None,
+    freed: float,
+) -> Link:
+    """The link, with the move that explains all changes best where it is the one that moved.
+
+    With x = m + error + move, error ~ N(0, S) and move ~ N(0, D_k) of each link k that moved, after
+    the fit ``move_k = G (x - m)``, ``G = D_k (S + D)^-1``, of ``G S_now G^T + D_k - G D_k``.
+
+    Args:
+        variable: the link.
+        prior: with what moved let go.
+        now: all that it holds, fitted.
+        p_value: of the link.
+        freed: by how many of CAD's sigmas it may have moved; 0 where it did not.
+    """
+    k, change, covariance = blocks_of(prior.held)[variable.name], now.change, now.covariance
+    if freed:
+        D = np.diag(np.square(freed * variable.sigma))
+        scale = np.sqrt(np.diag(prior.covariance))
+        P = np.linalg.inv(prior.covariance / np.outer(scale, scale)) / np.outer(scale, scale)
+        G = D @ P[k]
+        change = G @ change
+        covariance = G @ covariance @ G.T + D - G[:, k] @ D
+    else:
+        change, covariance = change[k], covariance[k, k]
+    return Link(
+        name=variable.name,
+        moved=freed > 0.0,
+        p_value=p_value,
+        change=change,
+        sigma=np.sqrt(np.diag(covariance)),
+        parameters=variable.dofs,
+        units=variable.units,
+    )

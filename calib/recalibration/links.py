@@ -1,0 +1,80 @@
+"""What became of each link since an earlier run, and how `summary.json` holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.blunders.chance import at_least
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link (a frame or an effect) then and now.
+
+    Args:
+        name: the variable.
+        moved: whether it moved, as chance hardly makes such a change beside all others that moved.
+        p_value: of the change, if it had not; None where the new data say nothing of it.
+        change: (n,) now minus then, per parameter, m or rad, if those that moved are the ones.
+        sigma: (n,) of the change where it moved, else of the estimate now; the same holds.
+        parameters: (n,) names.
+        units: (n,).
+        freed: by how many of CAD's sigmas the fit let it go from the earlier value; 0 where held.
+        instead: links of which one may have moved in its place: the data cannot tell.
+    """
+
+    name: str
+    moved: bool
+    p_value: float | None
+    change: np.ndarray
+    sigma: np.ndarray
+    parameters: tuple[str, ...]
+    units: tuple[str, ...]
+    freed: float = 0.0
+    instead: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """As summary.json holds it."""
+        return {
+            "name": self.name,
+            "moved": self.moved,
+            "p_value": None if self.p_value is None else at_least(self.p_value),
+            "parameters": self.parameters,
+            "units": self.units,
+            "change": self.change,
+            "sigma": self.sigma,
+            "freed": self.freed,
+            "instead": self.instead,
+        }
+
+
+def since(links: Sequence[Link], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """What became of each link since an earlier run, and since CAD, as summary.json holds it.
+
+    Args:
+        links: as a fit from that run found them.
+        earlier: the summary of that run.
+    """
+    far = moved_since_cad(earlier)
+    for link in (link for link in links if link.freed):
+        far[link.name] = float(np.hypot(link.freed, far.get(link.name, 0.0)))
+    return {"links": [link.document() for link in links], "moved_since_cad": far}
+
+
+def freedoms(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The links that a fit from an earlier run let go, each with by how many of CAD's sigmas: they
+    moved since, or may have in place of one that did. Earlier versions let go by one sigma what had
+    moved."""
+    links = summary.get("links", ())
+    found = {link["name"]: link.get("freed", float(link["moved"])) for link in links}
+    return {name: times for name, times in found.items() if times}
+
+
+def moved_since_cad(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The same over all runs, from one to the next, since the one that knew CAD alone: CAD does not
+    tell where these are now. Earlier versions told of the last alone."""
+    return dict(summary.get("moved_since_cad", freedoms(summary)))

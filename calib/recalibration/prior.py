@@ -1,0 +1,71 @@
+"""An earlier run's solution as a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from calib.effects import FrameOffset
+from calib.problem import Problem
+from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Unknown
+from calib.results.solution import Solution
+from chains import se3
+from chains.errors import InputError
+
+
+def earlier(problem: Problem, solution: Solution) -> JointPrior:
+    """An earlier solution as a joint prior over those variables that the problem has too.
+
+    Raises:
+        InputError: the two have nothing in common.
+    """
+    position = {key: i for i, key in enumerate(solution.keys)}
+    held, means, rows = [], {}, []
+    for name in problem.calibration:
+        variable = problem.variables[name]
+        index = [position.get(key) for key in variable.keys]
+        mean = _earlier_value(problem, variable, solution)
+        if None not in index and mean is not None:
+            held.append(variable)
+            means[name] = mean
+            rows += index
+    if not held:
+        raise InputError(
+            "--prior: that run and these recordings have no frame or effect in common; give a run "
+            "of the same rig"
+        )
+    return JointPrior(held, means, solution.covariance[np.ix_(rows, rows)])
+
+
+def change(prior: JointPrior, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Now minus then of all that the prior holds (P,), as one tangent at its means; and how that
+    goes (P, P) with a tangent at the values now, of which covariances are: a frame that is turned
+    far has other axes."""
+    changes, by = [], []
+    for v in prior.held:
+        changes.append(v.difference(prior.means[v.name], values[v.name]))
+        pose = v.kind == "pose"
+        by.append(se3.right_jacobian_inverse(changes[-1]) if pose else np.eye(v.dim))
+    return np.concatenate(changes), block_diag(*by)
+
+
+def _earlier_value(problem: Problem, variable: Unknown, solution: Solution) -> np.ndarray | None:
+    for source, terms in zip(problem.sources, problem.terms, strict=True):
+        part = solution.part(source.rig.name)
+        for term in terms:
+            if term.variable != variable.name:
+                continue
+            if isinstance(term.effect, FrameOffset):
+                frame = part.frames.get(term.effect.name)
+                if frame is None:
+                    return None
+                tree = source.rig.tree
+                T_cad = tree.edges[tree.edge_names.index(term.effect.name)].T_parent_child
+                return se3.log(se3.inverse(T_cad) @ frame.T_parent_child)[term.free]
+            effect = part.effects.get(term.effect.name)
+            return effect.estimate[term.free] if effect else None
+    frame = solution.shared.frames.get(variable.name)
+    return frame.T_parent_child if frame else None

@@ -1,0 +1,37 @@
+"""Recalibration: a fit to newer data from what an earlier run knew."""
+
+from __future__ import annotations
+
+from calib.problem import Problem
+from calib.problem.model import Model
+from calib.problem.prior import JointPrior
+from calib.recalibration.letgo import ALARM, let_go
+from calib.recalibration.links import Link
+from calib.recalibration.newer import RefittedPrior
+from calib.recalibration.prior import change
+from calib.results.intervals import Intervals, intervals
+from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress, shapes_freed, solve
+
+
+def solve_from(
+    problem: Problem, model: Model, prior: JointPrior, progress: Progress, alarm: float = ALARM
+) -> tuple[Estimate, Estimate, Intervals, list[Link]]:
+    """Estimate with an earlier solution as prior, letting go link by link of what has moved; the
+    same with its shapes among the unknowns, the intervals of that, and what became of each link;
+    see `let_go` and `shapes_freed`.
+    """
+    found: list[tuple[Estimate, Estimate, Intervals]] = []
+
+    def fit(prior: JointPrior) -> RefittedPrior:
+        estimate = solve(problem, prior, progress=progress)
+        freed = shapes_freed(estimate, model, prior)
+        known = intervals(freed, progress)
+        found.append((estimate, freed, known))
+        held = known.of([v.name for v in prior.held])
+        moved, turned = change(prior, estimate.values)
+        about_then = (turned @ each @ turned.T for each in (held.graph, held.covariance))
+        return RefittedPrior(moved, *about_then)
+
+    links = let_go(prior, fit, alarm)
+    return *found[-1], links
