@@ -76,9 +76,9 @@ from itertools import pairwise
 import numpy as np
 from scipy import special
 
+from calib.linear.cluster_sums import ALONE
 from calib.linear.clusters import summed
 from calib.linear.layout import positions
-from calib.results.intervals import ALONE
 
 UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the

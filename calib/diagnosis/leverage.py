@@ -20,11 +20,11 @@ from typing import Self
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from calib.linear.cluster_sums import ALONE
 from calib.linear.clusters import ClusteredRows
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import prior_rows
 from calib.problem.unknowns import Role
-from calib.results.intervals import ALONE
 
 Values = Mapping[str, np.ndarray]
 UNTOUCHED_SHARE = 1e-12  # of the largest: a direction that what a stop has alone does not touch

@@ -15,7 +15,9 @@ from calib.recalibration.letgo import ALARM
 from calib.recalibration.links import Link
 from calib.recalibration.prior import earlier
 from calib.recalibration.refit import solve_from
+from calib.results.errors import errors_at
 from calib.results.intervals import intervals
+from calib.results.sigmas import widened
 from calib.results.solution import Solution, solution_of
 from calib.solve.fit import Progress, solve
 from chains.errors import InputError
@@ -61,7 +63,8 @@ def _alone(model: Model, source: Source, progress: Progress) -> Solution | None:
         estimate = solve(problem, progress=progress)
     except InputError:
         return None
-    known = intervals(estimate, progress)
+    seen = errors_at(estimate.problem, estimate.values)
+    known = widened(intervals(estimate, progress), estimate, seen)
     return solution_of(problem, estimate, known) if estimate.converged else None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,25 @@ STRONG_ODDS = 20.0
 MOST_FITS = 4  # of one recalibration: one where nothing moved, two where data stay as they are
 
 
+class _Moves(NamedTuple):
+    """Which links moved, each with by how many of CAD's sigmas it may have; and for each those that
+    may have in its place."""
+
+    moved: dict[str, float]
+    instead: dict[str, dict[str, float]]
+
+    @classmethod
+    def of(cls, prior: JointPrior, data: NewerData, limit: float) -> _Moves:
+        """As newer data have it; arguments as of `_moved`."""
+        moved = _moved(prior, data, limit)
+        return cls(moved, _instead(prior, data, moved, limit))
+
+    @property
+    def free(self) -> dict[str, float]:
+        """All that are not known to be where they were."""
+        return {n: f for each in self.instead.values() for n, f in each.items()} | self.moved
+
+
 def let_go(
     prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior], alarm: float = ALARM
 ) -> list[Link]:
@@ -28,7 +48,8 @@ def let_go(
     Links that contradict prior and data beyond chance are taken to have moved, and the fit is
     repeated with these let go, until one finds what it let go. So are links of which one may have
     moved in their place, as their estimates are no surer. Where fits find in turn what another let
-    go, the last lets go what any two of them did.
+    go, the last lets go what any two of them did. Residuals that then exceed their sigmas are due
+    to something else: what seems to move because of that is held again.
 
     Args:
         prior: the earlier solution.
@@ -41,24 +62,34 @@ def let_go(
     last = False
     while True:
         held = prior.loosened(free)
-        data = NewerData.of(held, fit(held))
-        moved = _moved(prior, data, limit)
-        instead = _instead(prior, data, moved, limit)
-        found = {n: f for each in instead.values() for n, f in each.items()} | moved
+        now = fit(held)
+        found = _Moves.of(prior, NewerData.of(held, now), limit).free
         if last or _alike(found, free):
             break
         fits.append(free)
         last = len(fits) == MOST_FITS - 1 or any(_alike(found, earlier) for earlier in fits)
         both = {n: max(found.get(n, 0.0), free.get(n, 0.0)) for n in found | free}
         free = both if last else found
-    held = prior.loosened(moved)
+    data = NewerData.of(held, now.at_least)
+    moves = _Moves.of(prior, data, limit)
+    if moves.free.keys() != free.keys():
+        free = moves.free
+        fit(prior.loosened(free))
+    return _links(prior, data, moves, free)
+
+
+def _links(
+    prior: JointPrior, data: NewerData, moves: _Moves, free: Mapping[str, float]
+) -> list[Link]:
+    """What became of each link, given which were let go in the fit."""
+    held = prior.loosened(moves.moved)
     p_values, now, links = tests(held, data), data.fitted(held), []
-    for name in moved:
-        p_values[name] = tests(prior.loosened(_without(moved, name)), data)[name]
+    for name in moves.moved:
+        p_values[name] = tests(prior.loosened(_without(moves.moved, name)), data)[name]
     for v in prior.held:
-        link = _link(v, held, now, p_values[v.name], moved.get(v.name, 0.0))
-        alike = tuple(instead.get(v.name, {}))
-        links.append(replace(link, freed=free.get(v.name, 0.0), instead=alike))
+        link = _link(v, held, now, p_values[v.name], moves.moved.get(v.name, 0.0))
+        instead = tuple(moves.instead.get(v.name, {}))
+        links.append(replace(link, freed=free.get(v.name, 0.0), instead=instead))
     return links
 
 

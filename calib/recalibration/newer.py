@@ -21,12 +21,19 @@ class RefittedPrior(NamedTuple):
     """What a joint prior holds, fitted to newer data.
 
     ``change`` (P,) is now minus then, as a tangent there; ``graph`` and ``covariance`` (P, P) say
-    how well it is known now, as rows that err alone have it and as its intervals have it.
+    how well it is known now, as rows that err alone have it and as its intervals have it; and
+    ``widened`` (P, P) as they have it where residuals exceed their sigmas; None where they do not.
     """
 
     change: np.ndarray
     graph: np.ndarray
     covariance: np.ndarray
+    widened: np.ndarray | None = None
+
+    @property
+    def at_least(self) -> RefittedPrior:
+        """The same, as sure as residuals allow."""
+        return self if self.widened is None else self._replace(covariance=self.widened)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,9 @@ from calib.recalibration.letgo import ALARM, let_go
 from calib.recalibration.links import Link
 from calib.recalibration.newer import RefittedPrior
 from calib.recalibration.prior import change
+from calib.results.errors import errors_at
 from calib.results.intervals import Intervals, intervals
+from calib.results.sigmas import widened
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, shapes_freed, solve
 
@@ -28,10 +30,12 @@ def solve_from(
         freed = shapes_freed(estimate, model, prior)
         known = intervals(freed, progress)
         found.append((estimate, freed, known))
-        held = known.of([v.name for v in prior.held])
+        seen = errors_at(estimate.problem, estimate.values)
+        wide = widened(known, estimate, seen, prior.variables)
+        held, at_least = (each.of(prior.variables) for each in (known, wide))
         moved, turned = change(prior, estimate.values)
-        about_then = (turned @ each @ turned.T for each in (held.graph, held.covariance))
-        return RefittedPrior(moved, *about_then)
+        covariances = (held.graph, held.covariance, at_least.covariance)
+        return RefittedPrior(moved, *(turned @ each @ turned.T for each in covariances))
 
     links = let_go(prior, fit, alarm)
     return *found[-1], links

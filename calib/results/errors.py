@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Collection, Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from calib.effects import FrameOffset
-from calib.problem.problem import Block, Problem
-from calib.problem.unknowns import Role, Unknown
+from calib.forward import Values
+from calib.linear.parallel import over_stops
+from calib.problem import Problem
+from calib.problem.unknowns import Role
 from calib.residuals.beams import Rows
-from calib.residuals.groups import CAD
 from calib.residuals.scan import ScanStop
-from calib.residuals.seen import SeenBody, evaluated
+from calib.residuals.seen import evaluated
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
+from calib.solve.fit import Progress
 from calib.solve.reweight import unweighted
 
-# Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
-# less than one row's worth, chance alone puts the ratio anywhere.
-CHECKED = 1.0
 OF_POSITIONS = "tracked position"  # what is told of in mm where there are no scans
 
 
@@ -287,109 +286,18 @@ def _of_body(block: TrackedBody, squares: np.ndarray, expected: np.ndarray) -> E
     )
 
 
-def misfit(
-    estimate: Estimate, beams: Errors, elsewhere: Collection[str] = (), weighted: bool = False
-) -> dict[str, float]:
-    """How many times larger than their sigmas allow the residuals are, by kind of instrument.
-
-    For instruments that see bodies or targets the root of chi-square over its degrees of freedom,
-    their own unknowns taken off; for beams the rms of inliers over what is expected of them; for
-    the reference how far its surfaces had to be moved, over how far they may be off; for CAD the
-    root of chi-square of how far frames moved from there, over the redundancy of these moves. About
-    1 or less when all is well: an effect that is missing in the LiDAR may be laid on beams or on
-    surfaces, and shows in either.
-
-    Args:
-        estimate: the solution.
-        beams: of all scans, as fitted.
-        elsewhere: frames of whose places something other than CAD tells.
-        weighted: whether groups of rows that are further off than chance puts one, and whose pull
-            is bounded by a robust weight, are left out: what is left tells how right sigmas are. Of
-            CAD, which has few, they count with their weight.
-    """
-    values, unknowns = estimate.values, estimate.problem.variables
-    out = {}
-    # Beams, where there are any, hold where the rig stands; what is a level's own is not there.
-    place = set() if beams.count else {Role.PLACE}
-    level = {Role.GRAVITY, Role.ZERO}
-    owners = {"tracker": place, "level": level, "target": {Role.TARGET, Role.GRAVITY}}
-    for kind, own in owners.items():
-        blocks = [b for b in estimate.problem.blocks if b.kind == kind]
-        if blocks:
-            out[kind] = _of_blocks(estimate, blocks, own, weighted)
-    if beams.count and estimate.scans:
-        out["beams"] = beams.misfit
-    surfaces = [u for u in unknowns.values() if u.role is Role.SURFACE]
-    if surfaces:
-        worst = max(_prior_cost(u, values[u.name]) / u.dim for u in surfaces)
-        out["reference"] = float(np.sqrt(worst))
-    return out | _of_cad(estimate, elsewhere, weighted)
+def errors_at(
+    problem: Problem, values: Values, progress: Progress = lambda what, done, total: None
+) -> Errors:
+    """Of all beams at these values, or of tracked bodies where there are no scans."""
+    if not problem.scans:
+        return body_errors(problem.bodies, values, None)
+    total = Errors()
+    for i, found in enumerate(over_stops(partial(_of_scan, values), problem.scans)):
+        progress("residuals of beams", i, len(problem.scans))
+        total += found
+    return total
 
 
-def _of_blocks(
-    estimate: Estimate, blocks: Sequence[Block], own: Container[Role], weighted: bool
-) -> float:
-    """Of trackers, levels or targets; see `misfit`.
-
-    Args:
-        estimate: the solution.
-        blocks: of one kind.
-        own: roles of the unknowns that are these rows' own.
-        weighted: as of `misfit`. Where most groups would be left out, nothing tells which are good,
-            and all count with their weights.
-    """
-    values, unknowns = estimate.values, estimate.problem.variables
-    counted = list(blocks if weighted else map(unweighted, blocks))
-    rows = [(b, r, _bulk(b)) for b, r in zip(counted, _rows_of(counted, values), strict=True)]
-    if weighted:
-        told = sum(int(bulk.sum()) for *_, bulk in rows)
-        if 2 * told > sum(b.rows for b in blocks):
-            rows = [(b, r[bulk], bulk[bulk]) for b, r, bulk in rows if bulk.any()]
-    seen = [unknowns[n] for n in {n: None for b, *_ in rows for n in b.variables}]
-    joints = [u for u in seen if u.role is Role.JOINTS]
-    free = sum(u.told for u in seen if u.role in own) + sum(u.unread for u in joints)
-    if weighted:
-        free += sum(u.dim - u.unread for u in joints if u.weight < 1.0)
-        joints = [u for u in joints if u.weight >= 1.0]
-    chi2 = sum(float(r @ r) for _, r, _ in rows)
-    chi2 += sum(_prior_cost(u, values[u.name]) for u in joints)
-    return float(np.sqrt(chi2 / max(1, sum(len(r) for _, r, _ in rows) - free)))
-
-
-def _rows_of(blocks: Sequence[Block], values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-    """Whitened rows of each of some blocks of one kind."""
-    if isinstance(blocks[0], SeenBody):
-        return [rows for rows, _ in evaluated(blocks, values)]
-    return [block.evaluate(values, False)[0] for block in blocks]
-
-
-def _bulk(block: Block) -> np.ndarray:
-    """Which rows (N,) of a block have their full weight."""
-    if block.weight is None:
-        return np.ones(block.rows, bool)
-    return np.repeat(block.weight >= 1.0, block.rows // len(block.weight))
-
-
-def in_cad(problem: Problem) -> frozenset[str]:
-    """Unknowns of frames that CAD places."""
-    terms = (term for terms in problem.terms for term in terms)
-    return frozenset(t.variable for t in terms if isinstance(t.effect, FrameOffset))
-
-
-def _of_cad(estimate: Estimate, elsewhere: Collection[str], weighted: bool) -> dict[str, float]:
-    """Of the places that frames have in CAD, as far as others contradict them (Birge 1932)."""
-    frames = in_cad(estimate.problem) - set(elsewhere)
-    start = np.cumsum([0, *(u.dim for u in estimate.variables)])
-    variance = np.diag(estimate.covariance)
-    chi2 = left = 0.0
-    for unknown, first in zip(estimate.variables, start, strict=False):
-        if unknown.name in frames:
-            weight = unknown.weight if weighted else 1.0
-            chi2 += weight * _prior_cost(unknown, estimate.values[unknown.name])
-            told = variance[first : first + unknown.dim] / np.square(unknown.sigma)
-            left += float(np.sum(np.maximum(1.0 - weight * told, 0.0)))
-    return {CAD: float(np.sqrt(chi2 / left))} if left > CHECKED else {}
-
-
-def _prior_cost(unknown: Unknown, value: np.ndarray) -> float:
-    return float(np.sum(np.square((value - unknown.mean) / unknown.sigma)))
+def _of_scan(values: Values, scan: ScanStop) -> Errors:
+    return row_errors(scan.rows(values))

@@ -28,7 +28,7 @@ FIT = (
     Stage("estimate", ("looking for depth edges", "pass "), 0.62),
     Stage("sigmas", ("errors in common of rows",), 0.11),
     Stage("held-out error", ("without ",), 0.19),
-    Stage("residuals", ("nominal residuals", "writing residuals"), 0.08),
+    Stage("residuals", ("residuals of beams", "writing residuals"), 0.08),
 )
 DIAGNOSE = (
     Stage("tests", ("testing", "looking for depth edges", "fitting", "pass "), 0.67),

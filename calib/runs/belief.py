@@ -13,13 +13,12 @@ from calib.residuals.groups import CAD
 from calib.results.errors import judged_mm
 from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
+from calib.results.sigmas import TOLERATED
 from calib.runs.run import Run
 
 # Times its sigmas, or what is expected: residuals that something large is behind. A choice: sigmas
 # of data sheets are wrong by a factor of two at times, and then widened.
 FAR_OFF = 3.0
-# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
-TOLERATED = 1.2
 # Of frames few moves from CAD are checked by anything: beyond this chance puts 6 of them in one rig
 # of a hundred, and 17, as of an arm with two bodies, in one of 10,000.
 TOLERATED_OF_CAD = 1.7

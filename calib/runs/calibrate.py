@@ -16,8 +16,7 @@ from calib import outputs
 from calib import problem as problems
 from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, is_known, load_effects, split, trust_in
-from calib.forward import Values
-from calib.linear.parallel import one_blas_thread, over_stops
+from calib.linear.parallel import one_blas_thread
 from calib.outputs.journal import going_on
 from calib.problem import Problem
 from calib.problem.model import Model, Source
@@ -25,16 +24,7 @@ from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
 from calib.recalibration.prior import earlier
 from calib.recalibration.refit import solve_from
-from calib.residuals.groups import CAD
-from calib.residuals.scan import ScanStop
-from calib.results.errors import (
-    OF_POSITIONS,
-    Errors,
-    body_errors,
-    misfit,
-    of_orientations,
-    row_errors,
-)
+from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
 from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
 from calib.results.misfit import (
@@ -44,9 +34,10 @@ from calib.results.misfit import (
 )
 from calib.results.reach import reach
 from calib.results.rings import documents as odd_rings
+from calib.results.sigmas import misfit, widened
 from calib.results.solution import solution_of, up_of, zeros_of
 from calib.results.stages import FIT, staged
-from calib.runs.belief import TOLERATED, limits
+from calib.runs.belief import limits
 from calib.runs.reopen import (
     effects_of_prior,
     identity,
@@ -229,7 +220,7 @@ def _fit(
     else:
         estimate, freed, known, links = solve_from(problem, model, held, progress)
     unseen, unit = _held_out(sources, model, estimate, folder / RESIDUALS, choices, progress)
-    nominal = _nominal(problem, progress)
+    nominal = errors_at(problem, problem.initial, progress)
     seen_at = ColumnRanges(model.effects)
     by_stop = write_residuals(folder / RESIDUALS, estimate, seen_at, progress)
     seen = sum(by_stop.values(), Errors())
@@ -237,11 +228,7 @@ def _fit(
         seen = body_errors(problem.bodies, estimate.values, None)
     _refuse_nothing(problem, seen)
     elsewhere = held.variables if held else ()  # an earlier run stands in place of CAD
-    bulk = misfit(estimate, seen, elsewhere, weighted=True)  # one wild row widens no sigma
-    large = {kind: times for kind, times in bulk.items() if times > TOLERATED}
-    cad = large.pop(CAD, 1.0)
-    widened = max([1.0, *large.values()])
-    known = known.at_least(widened, cad)
+    known = widened(known, estimate, seen, elsewhere)
     calibration = known.of([v.name for v in estimate.variables])
     solution = solution_of(problem, estimate, known)
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
@@ -256,13 +243,13 @@ def _fit(
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
-    summary |= {"sigmas_widened_by": widened, "cad_widened_by": cad, "held_out_by": unit}
+    summary |= {"sigmas_widened_by": known.least, "cad_widened_by": known.cad, "held_out_by": unit}
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document() if reached else None
-    summary |= {"up": up} if (up := up_of(estimate, widened)) else {}
-    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, widened)) else {}
+    summary |= {"up": up} if (up := up_of(estimate, known.least)) else {}
+    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, known.least)) else {}
     summary["seconds"] = time.monotonic() - began
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
@@ -281,21 +268,6 @@ def _refuse_nothing(problem: Problem, seen: Errors) -> None:
             f"{problem.sources[0].recording.folder}: no beam meets a surface and no tracked body "
             "was seen, so there is nothing to fit to; 'rigcal check' says what is missing"
         )
-
-
-def _nominal(problem: Problem, progress: Progress) -> Errors:
-    """Residuals with every frame and effect as on paper, the rig where it then seems to be."""
-    if not problem.scans:
-        return body_errors(problem.bodies, problem.initial, None)
-    total = Errors()
-    for i, found in enumerate(over_stops(partial(_errors, problem.initial), problem.scans)):
-        progress("nominal residuals", i, len(problem.scans))
-        total += found
-    return total
-
-
-def _errors(values: Values, scan: ScanStop) -> Errors:
-    return row_errors(scan.rows(values))
 
 
 def _held_out(

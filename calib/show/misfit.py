@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from calib.results.outstanding import groups, moves, times
+from calib.residuals.groups import CAD
+from calib.results.outstanding import groups, moves, times, together_told
+from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
 
 if TYPE_CHECKING:
     from calib.runs.run import Run
@@ -61,3 +63,31 @@ def worst_of(run: Run) -> tuple[str, str]:
     group = next((f"{name} {times(x)}" for name, x in groups(run.summary).items()), "")
     move = next((f"{name} {times(m['move_sigmas'])}" for name, m in moves(run.summary).items()), "")
     return group, move
+
+
+def misfit_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
+    """That residuals are larger than they may be, or err together, and what was done about it."""
+    if (factor := summary.get("cad_widened_by", 1.0)) > TOLERATED_OF_CAD:
+        yield (
+            f"{misfit_sentence(CAD, factor)}: a value of CAD is wrong, or a sigma in rig.yaml too "
+            f"small; of every sigma above, the part that is due to CAD is widened by that"
+        )
+    if (factor := summary.get("sigmas_widened_by", 1.0)) > 1.0:
+        instruments = {kind: x for kind, x in summary["misfit"].items() if kind != CAD}
+        kind = max(instruments, key=instruments.get)
+        what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
+        yield (
+            f"the {what} are {factor:.1f} times larger than their sigmas allow: something is "
+            f"missing from the model, or a sigma in rig.yaml too small; {_widened(summary)}"
+        )
+    for told in together_told(summary):
+        yield f"{told}; 'rigcal diagnose' looks for the cause"
+
+
+def _widened(summary: Mapping[str, Any]) -> str:
+    """What is wider where residuals exceed their sigmas."""
+    if "links" not in summary:
+        return "every sigma above is widened by that"
+    moved = any(link["moved"] for link in summary["links"])
+    doubt = ", and what moved may have moved because of it" if moved else ""
+    return f"of every sigma above, the part that these data tell is widened by that{doubt}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,12 +15,10 @@ from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
 from calib.diagnosis.suggest import span
-from calib.residuals.groups import CAD
-from calib.results.outstanding import shown, standing_out, together_told
-from calib.runs.belief import TOLERATED_OF_CAD, misfit_sentence
+from calib.results.outstanding import shown, standing_out
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.headline import MOVED_WORDS, Words, by_what_became, closing, moved_sentence
-from calib.show.misfit import beams_told
+from calib.show.misfit import beams_told, misfit_warnings
 from chains import escape
 
 if TYPE_CHECKING:
@@ -110,33 +108,13 @@ def print_run(run: Run, whole: bool = False) -> None:
         print_pairs(console, "how well the arm is known", [("", t) for t in predicted["told"]])
     if told := standing_out(summary):
         print_pairs(console, "what does not fit", [("", line) for line in told])
-    for warning in _warnings(summary):
+    for warning in misfit_warnings(summary):
         console.print(warning, style="bold")
         console.print()
     *lines, command = closing(run)
     for line in lines:
         console.print(line, style="bold")
     console.print(command, style="bold", soft_wrap=True)
-
-
-def _warnings(summary: dict[str, Any]) -> Iterator[str]:
-    """That residuals are larger than they may be, or err together, and what was done about it."""
-    if (factor := summary.get("cad_widened_by", 1.0)) > TOLERATED_OF_CAD:
-        yield (
-            f"{misfit_sentence(CAD, factor)}: a value of CAD is wrong, or a sigma in rig.yaml too "
-            f"small; of every sigma above, the part that is due to CAD is widened by that"
-        )
-    if (factor := summary.get("sigmas_widened_by", 1.0)) > 1.0:
-        instruments = {kind: x for kind, x in summary["misfit"].items() if kind != CAD}
-        kind = max(instruments, key=instruments.get)
-        what = "errors of the reference" if kind == "reference" else f"residuals of {kind}"
-        yield (
-            f"the {what} are {factor:.1f} times larger than their sigmas allow: something is "
-            f"missing from the model, or a sigma in rig.yaml too small; every sigma above is "
-            f"widened by that"
-        )
-    for told in together_told(summary):
-        yield f"{told}; 'rigcal diagnose' looks for the cause"
 
 
 def effect_page(effect: Effect) -> dict[str, Any]:

@@ -13,9 +13,10 @@ from scipy import stats
 from scipy.linalg import sqrtm
 
 from calib import problem as problems
+from calib.linear.cluster_sums import ClusterSums
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.problem.model import Model, Source
-from calib.results.intervals import ROOM_PARTS, Intervals, _Sums, intervals
+from calib.results.intervals import ROOM_PARTS, Intervals, intervals
 from calib.simulation import Spec
 from calib.solve.clustered import BeamsAlong
 from calib.solve.fit import solve
@@ -58,7 +59,7 @@ def test_the_formula_is_that_of_the_module():
     C = np.linalg.inv(J.T @ J + prior.T @ prior)
     sigma = np.sqrt(np.diag(C))
     A, paper = J @ C / sigma, prior @ C / sigma
-    sums = _Sums.over(C / np.outer(sigma, sigma))
+    sums = ClusterSums.over(C / np.outer(sigma, sigma))
     for stops in np.array_split(rng.permutation(12), 7):  # each cell at once
         some = rng.permutation(np.flatnonzero(np.isin(stop, stops)))
         sums.add(rows(A[some], b[some], stop[some], part[some]))
@@ -105,7 +106,7 @@ def test_intervals_hold_the_truth_where_stops_err_together(
         y = rng.normal(size=len(stop)) + together * rng.normal(size=stops)[stop]
         C = np.linalg.inv(J.T @ J)
         x, sigma = C @ J.T @ y, np.sqrt(np.diag(C))
-        sums = _Sums.over(C / np.outer(sigma, sigma))
+        sums = ClusterSums.over(C / np.outer(sigma, sigma))
         sums.add(rows(J @ C / sigma, y - J @ x, stop, np.full(len(stop), -1)))
         held.append((np.abs(x / sigma) < 1.96 * sums.wider())[1:])
         plain.append((np.abs(x / sigma) < 1.96)[1:])
@@ -117,7 +118,7 @@ def test_intervals_hold_the_truth_where_stops_err_together(
 
 def test_one_stop_alone_widens_nothing_nor_does_none():
     A = np.array([[0.6], [0.8]])
-    one, none = _Sums.over(np.eye(1)), _Sums.over(np.eye(1))
+    one, none = ClusterSums.over(np.eye(1)), ClusterSums.over(np.eye(1))
     one.add(rows(A, np.zeros(2), np.zeros(2, int), np.full(2, -1)))
     none.add(rows(A, np.zeros(2), np.full(2, -1), np.full(2, -1)))
     assert one.wider() == none.wider() == 1.0
@@ -133,6 +134,7 @@ def known(wider):
         graph=graph,
         data=graph @ J.T @ J @ graph,
         paper=graph @ np.diag([1.0, 1.0, 0.0]) @ graph,
+        earlier=np.zeros((3, 3)),
         wider=np.array(wider),
     )
 
@@ -163,6 +165,17 @@ def test_what_the_data_determine_is_as_much_wider_as_they_say():
     assert both @ naive @ both == pytest.approx(before, rel=0.01)
 
 
+def test_what_an_earlier_run_knew_is_no_less_known_as_new_rows_are_worse_than_they_say():
+    """Rows err by 1.5 times their sigmas: so does what they tell, and that alone."""
+    found = known([1.0, 1.0, 1.0])
+    found = replace(found, earlier=found.graph - found.data).at_least(1.5)
+    expected = 1.5**2 * found.data + found.earlier
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-12)
+    assert np.sqrt(found.covariance[0, 0] / found.graph[0, 0]) == pytest.approx(1.0, abs=1e-3)
+    beside = replace(found, wider=np.array([1.0, 1.0, 4.0]))
+    assert beside.covariance[2, 2] == pytest.approx(16.0 * found.graph[2, 2])
+
+
 def test_what_rests_on_cad_alone_is_as_much_wider_as_cad_is_worse():
     found = known([1.0, 1.0, 4.0]).at_least(1.0, cad=3.0)
     ratio = np.sqrt(np.diag(found.covariance) / np.diag(found.graph))
@@ -182,7 +195,7 @@ def test_what_rests_on_cad_alone_is_as_much_wider_as_cad_is_worse():
 
 def test_beams_as_sums_and_their_scatter_are_worth_what_their_rows_are():
     rng = np.random.default_rng(4)
-    size, whole, parts = 3, _Sums.over(np.eye(3)), _Sums.over(np.eye(3))
+    size, whole, parts = 3, ClusterSums.over(np.eye(3)), ClusterSums.over(np.eye(3))
     for stop in range(6):
         A, b = 0.1 * rng.normal(size=(60, size)), rng.normal(size=60)
         place = rng.permutation(np.r_[[7, 2, 9, 4], rng.choice([7, 2, 9, 4], 56)])
@@ -225,9 +238,9 @@ def test_the_rows_of_a_fit_are_all_that_is_known_and_lead_nowhere(fitted, monkey
         if scatter is not None:
             add(self, scatter)
 
-    monkeypatch.setattr(_Sums, "add", add)
-    monkeypatch.setattr(_Sums, "add_stop", add_stop)
-    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
+    monkeypatch.setattr(ClusterSums, "add", add)
+    monkeypatch.setattr(ClusterSums, "add_stop", add_stop)
+    monkeypatch.setattr(ClusterSums, "wider", lambda self: np.ones(len(self.priors)))
     intervals(fitted)
     np.testing.assert_allclose(seen.share, 1.0, atol=1e-6)
     np.testing.assert_allclose(seen.moved, 0.0, atol=2e-3)
@@ -243,9 +256,9 @@ def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fi
     def add_stop(self, sums, scatter):
         cells.update({(sums.stop, part): 1 for part in sums.place.tolist()})
 
-    monkeypatch.setattr(_Sums, "add", add)
-    monkeypatch.setattr(_Sums, "add_stop", add_stop)
-    monkeypatch.setattr(_Sums, "wider", lambda self: np.ones(len(self.priors)))
+    monkeypatch.setattr(ClusterSums, "add", add)
+    monkeypatch.setattr(ClusterSums, "add_stop", add_stop)
+    monkeypatch.setattr(ClusterSums, "wider", lambda self: np.ones(len(self.priors)))
     intervals(fitted)
     beams = {part for stop, part in cells if stop >= 0 and part >= 0}
     patches = sum(n for (stop, part), n in cells.items() if stop < 0 and part in beams)

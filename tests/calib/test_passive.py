@@ -13,7 +13,7 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.results.check import check
-from calib.results.errors import misfit
+from calib.results.sigmas import misfit
 from calib.simulation import PRESETS, Spec, simulate
 from calib.solve.fit import solve
 from chains.errors import InputError

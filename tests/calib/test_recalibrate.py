@@ -52,6 +52,7 @@ def as_the_graph_has_them(estimate, _):
         graph=C,
         data=C,
         paper=np.zeros_like(C),
+        earlier=np.zeros_like(C),
         wider=np.ones(len(C)),
     )
 
@@ -83,6 +84,7 @@ def world(monkeypatch):
             x = covariance @ (weight @ m + J.T @ y)
             return SimpleNamespace(
                 variables=variables,
+                problem=None,
                 values=values(x),
                 covariance=covariance,
                 information=information,
@@ -92,6 +94,8 @@ def world(monkeypatch):
         known = as_the_graph_has_them if noise == 1.0 else as_the_rows_have_them
         monkeypatch.setattr(refit, "intervals", known)
         monkeypatch.setattr(refit, "shapes_freed", lambda estimate, *_: estimate)
+        monkeypatch.setattr(refit, "errors_at", lambda *_: None)
+        monkeypatch.setattr(refit, "widened", lambda known, *_: known)
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
         return {link.name: link for link in refit.solve_from(problem, Model(), prior, None)[-1]}
