@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.diagnosis import search as steps
 from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
 from calib.diagnosis.search.shapes import retuned
@@ -180,3 +181,30 @@ def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
     assert len(sizes) == 2
     for (_, x), size_m in zip(sorted(sizes.items()), (1e-3, -2e-3), strict=True):
         assert x[3] == pytest.approx(size_m, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("more", "dof", "sure"), [(6.0, 1, 0.01), (6.0, 6, None), (1.0, 1, "kept")]
+)
+def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
+    monkeypatch, more, dof, sure
+):
+    """That something is missing is confirmed; which of two of one parameter it is, the odds say."""
+
+    def candidate(name, evidence, dof):
+        return SimpleNamespace(
+            effect=find(name), test=SimpleNamespace(evidence=lambda scale: evidence, dof=dof)
+        )
+
+    named, rival = candidate("range_scale", 10.0, 1), candidate("optitrack_scale", 10.0 + more, dof)
+    step = SimpleNamespace(
+        candidate=named,
+        rivals=[rival],
+        p_adjusted=0.01,
+        after=SimpleNamespace(named=SimpleNamespace(common=1.0)),
+        judged=SimpleNamespace(inflation=1.0),
+    )
+    asked = []
+    monkeypatch.setattr(steps, "_fitted", lambda *a, sure: asked.append((a[1], sure)) or [rival])
+    found = steps._by_likelier(None, step, [], None)
+    assert (found, asked) == (([], []) if sure == "kept" else ([rival], [(rival, sure)]))

@@ -304,9 +304,24 @@ def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[Nam
     better shapes. Which one is best may change once it is fitted, as rows then scatter less."""
     for candidate in suspects(look.named, ALPHA_EFFECT):
         if more := _fitted(look, candidate, found, progress):
-            likelier = _likelier(more[-1])
-            return (likelier and _fitted(look, likelier, found, progress)) or more
+            return _by_likelier(look, more[-1], found, progress) or more
     return found
+
+
+def _by_likelier(
+    look: Look, step: NamedEffect, found: list[NamedEffect], progress: Progress
+) -> list[NamedEffect]:
+    """What was found, and a rival that explains more than the effect just named, fitted; nothing
+    where there is none.
+
+    That something of the kind is missing is as sure as the effect named first has it. So a rival of
+    no more parameters need not be confirmed by itself.
+    """
+    likelier = _likelier(step)
+    if likelier is None:
+        return []
+    sure = step.p_adjusted if likelier.test.dof <= step.candidate.test.dof else None
+    return _fitted(look, likelier, found, progress, sure=sure)
 
 
 def _one_for_all(
@@ -333,12 +348,14 @@ def _fitted(
     found: list[NamedEffect],
     progress: Progress,
     instead: Sequence[Blunder] = (),
+    sure: float | None = None,
 ) -> list[NamedEffect]:
     """What was found, and a candidate, fitted; nothing where it is not confirmed. One that is tried
-    `instead` of blunders is confirmed if it leaves no blunder, at their p-value."""
+    `instead` of blunders is confirmed if it leaves no blunder, at their p-value; where another has
+    confirmed what it explains, at that of the other (`sure`)."""
     near, finest = look.closely(candidate, progress)
     test, p = judged(near, finest, progress)
-    p = max((b.p_adjusted for b in instead), default=p)
+    p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
     if p >= ALPHA_EFFECT:
         return []
     stand = tried(look.stand.with_effects, [finest.effect], progress)
