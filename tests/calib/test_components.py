@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize, stats
 
 from calib import add, diagnose, fit
-from calib.diagnosis.chance import AtZero
+from calib.diagnosis.chance.at_zero import AtZero
 from calib.effects import CATALOGUE, find
 from calib.problem import build
 from calib.problem.model import Model, Source

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,8 @@ from scipy import special
 from calib.blunders.chance import LEVELS, POWER, after_looks, at_least
 from calib.blunders.judged import Blunder
 from calib.blunders.shifts import beside_bodies, of_poses
+from calib.diagnosis.chance.alike import UNITS, Unlike, unlike
+from calib.diagnosis.chance.at_zero import AtZero
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
@@ -29,7 +30,6 @@ from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, 
 from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
 from calib.solve.components import (
-    DIRECTION_SEEN,
     LEAST_SD,
     Checks,
     Sums,
@@ -45,7 +45,6 @@ ALPHA_SCATTER = LEVELS["scatter by chance"]
 # Members, or checks of a body's rows, below which nothing is said of their spread.
 FEWEST_MEMBERS = 4
 SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
-SCATTER_DRAWS = 2000  # of chance: their mean, from which p-values follow, is known to some 5 %
 # Of wider rows: who scatters.
 NOUNS = {
     Site.TRACKER: "The tracker scatters",
@@ -53,7 +52,6 @@ NOUNS = {
     Site.TARGET: "Targets scatter",
     Site.REFERENCE: "The mesh scatters",
 }
-GRID = np.append(0.0, np.geomspace(1e-3, 1e3, 61))  # of d, in units of the mean 1 / l
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Spread:
     @property
     def told(self) -> str:
         """As people read it."""
-        unit = {"m": "mm", "rad": "mrad"}[self.unit]
+        unit = UNITS[self.unit]
         return f"{1e3 * self.sd:.2f} ± {1e3 * self.sigma:.2f} {unit}"
 
     def document(self, effect: str) -> dict[str, Any]:
@@ -96,6 +94,7 @@ class Chance:
         p_value: how often as much is seen where there is none.
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
+        unlike: of joint readings, how much more some joints scatter than others, where they do.
     """
 
     effect: Scatter
@@ -104,6 +103,7 @@ class Chance:
     p_value: float
     detectable: float
     rivals: Sequence[str] = ()
+    unlike: Sequence[Unlike] = ()
 
     @property
     def p_adjusted(self) -> float:
@@ -118,8 +118,10 @@ class Chance:
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
         if self.effect.widens:
-            again = _of_rows(self.effect, squares(estimate), estimate.problem)
-            return replace(again, rivals=self.rivals) if again else self
+            again = _of_rows(self.effect, squares(estimate), estimate.problem) or self
+            asked = ("rad", "m") if self.effect.site is Site.JOINTS else ()
+            each = [found for unit in asked if (found := unlike(estimate, unit))]
+            return replace(again, rivals=self.rivals, unlike=each)
         known, found = spreads(estimate), []
         for unknown in by_chance(estimate.problem):
             if unknown.owner.effect == self.effect.name:  # of whichever rig
@@ -166,6 +168,7 @@ class Chance:
             "indistinguishable_from": list(self.rivals),
             "rivals": [],
             "matters": None,
+            "unlike": [each for some in self.unlike for each in some.document()],
         }
 
     def _name(self, spread: Spread) -> str:
@@ -200,78 +203,12 @@ class Chance:
             if self.rivals
             else ""
         )
+        apart = "".join(f"{each.sentence} " for each in self.unlike)
         return (
             f"{what}; random as far as these data show (p = {self.p_adjusted:.1g}). {rivals}"
-            f"{name} widens every sigma by that; it predicts nothing at another {each}, so the "
-            "held-out error does not fall."
+            f"{apart}{name} widens every sigma by that; it predicts nothing at another {each}, so "
+            "the held-out error does not fall."
         )
-
-
-class AtZero:
-    """The test that a group's values do not scatter.
-
-    Args:
-        told: of that group.
-    """
-
-    def __init__(self, told: Told) -> None:
-        values, axes = np.linalg.eigh(told.information)
-        seen = values > DIRECTION_SEEN * max(values[-1], 0.0)
-        self.l = values[seen]
-        self.w = np.square(axes[:, seen].T @ told.score) / self.l
-        self.d = GRID / np.mean(self.l) if len(self.l) else GRID
-
-    @property
-    def members(self) -> int:
-        """How many anything tells of: their mean belongs to a range zero that all share."""
-        return len(self.l) + 1
-
-    def statistic(self, w: np.ndarray) -> np.ndarray:
-        """Twice the log of the likelihood ratio (R,) of squares (R, n)."""
-        grown = 1.0 + self.d[:, None] * self.l
-        gain = w @ (1.0 - 1.0 / grown).T - np.log(grown).sum(axis=1)
-        return gain.max(axis=1)
-
-    def spread(self) -> float:
-        """The likeliest sd."""
-        gain = [float(self._gain(d)) for d in self.d]
-        return float(np.sqrt(self.d[int(np.argmax(gain))]))
-
-    def _gain(self, d: float) -> float:
-        grown = 1.0 + d * self.l
-        return self.w @ (1.0 - 1.0 / grown) - np.log(grown).sum()
-
-    def drawn(self, d: float = 0.0) -> np.ndarray:
-        """The statistic (SCATTER_DRAWS,) of draws at a variance."""
-        normal = np.random.default_rng(0).standard_normal((SCATTER_DRAWS, len(self.l)))
-        return self.statistic(np.square(normal) * (1.0 + d * self.l))
-
-    @cached_property
-    def tail(self) -> tuple[float, float]:
-        """Share of what is not zero by chance, and the scale of the chi-square that it is."""
-        drawn = self.drawn()
-        share = float(np.mean(drawn > 1e-9))
-        return share, float(drawn.mean() / share) if share else 1.0
-
-    def p_value(self) -> tuple[float, float]:
-        """The statistic, and how often chance alone makes one as large."""
-        share, scale = self.tail
-        statistic = float(self.statistic(self.w[None])[0])
-        p = share * float(special.chdtrc(1, statistic / scale)) if statistic > 1e-9 else 1.0
-        return statistic, p
-
-    def detectable(self, alpha: float) -> float:
-        """The sd that is found with 80 % power at a level."""
-        share, scale = self.tail
-        if share <= alpha:
-            return np.inf
-        limit = scale * float(special.chdtri(1, alpha / share))
-        first, last = 0, len(self.d)  # of the grid: too small for sure, and large enough
-        while last - first > 1:
-            middle = (first + last) // 2
-            enough = np.mean(self.drawn(self.d[middle]) > limit) > POWER
-            first, last = (first, middle) if enough else (middle, last)
-        return float(np.sqrt(self.d[last])) if last < len(self.d) else np.inf
 
 
 def chances(
