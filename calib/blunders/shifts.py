@@ -30,11 +30,13 @@ from calib.problem.problem import Problem
 from calib.problem.spread import Whose
 from calib.residuals.groups import ALONG_BEAMS, Group
 from calib.residuals.store import drawn_evenly
-from calib.solve.components import Sums, Told, squares_beside_bodies
+from calib.solve.components import Sums, squares_beside_bodies
+from calib.solve.components.told import Told, ToldApart
 
 # Scans that tell how places of the LiDAR scatter, of more: a choice. So many tell it to 1 part in
 # 24, and the matrix over 6 unknowns of each is factored in 2 s, that of 1,000 in 40 s.
 TELLING_SCANS = 300
+ASKED = {"body", "joints"}  # kinds of groups whose scatter is compared
 Squares = Mapping[str, tuple[float, float]]
 
 
@@ -137,6 +139,41 @@ def beside_bodies(
     return squares_beside_bodies(
         problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
     )
+
+
+def told_by_stop(
+    whole: Linearisation, problem: Problem, whose: Mapping[Whose, int], wild: Collection[Group]
+) -> ToldApart:
+    """What rows of bodies and of joints say of their errors beyond their sigmas, all of a stop
+    together and at their full weights, in these sigmas.
+
+    Args:
+        whole, problem: as of `shifts`.
+        whose: rows that are asked -> the group that they are of.
+        wild: blunders; stops that have one are not asked.
+    """
+    others, found = Others.of(whole), []
+    for sets in others.groups(problem):
+        H, b = others.against([rows for some in sets for rows in some])
+        for some, mine in zip(sets, parts(sets), strict=True):
+            group = np.array([whose.get(each, -1) for rows in some for each in _whose(rows)])
+            at = np.flatnonzero(group >= 0)
+            if len(at) and not any(set(wild).intersection(rows.groups) for rows in some):
+                left, score = at_their_sigmas(some, H[mine, mine], b[mine])
+                left = block_diag(*(rows.own_information for rows in some)) - left
+                found.append(Told(score[at], left[np.ix_(at, at)], group[at]))
+    return ToldApart(found)
+
+
+def _whose(rows: GroupRows) -> list[Whose | None]:
+    """Whose each row (m,) is, of a body or a joint; None of others."""
+    kinds = {group.kind for group in rows.groups}
+    if rows.information is not None or not kinds <= ASKED:
+        return [None] * len(rows.A)
+    (kind,) = kinds
+    what = next(iter(rows.groups)).what
+    each = zip(rows.axes, rows.units, strict=True)
+    return [Whose(kind, what if kind == "body" else axis, unit) for axis, unit in each]
 
 
 def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:

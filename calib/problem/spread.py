@@ -2,7 +2,7 @@
 
 A spread has a key: the name of the unknown whose values scatter, with ``.sd.unit`` after it where
 these are of several units; or, where rows have a wider sigma,
-``effect.whose.unit``, whose being a tracked body, the joints, what of targets, or a kind of part of
+``effect.whose.unit``, whose being a tracked body, a joint, what of targets, or a kind of part of
 the mesh; or, of how uneven the planes of a recording are, which no effect needs to say,
 ``planes/region.m``.
 """
@@ -20,7 +20,6 @@ from calib.forward import Term
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
 from calib.problem.unknowns import Role, Unknown
-from calib.residuals.groups import JOINTS
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.targets import PARTS_OF_SIGMAS, HangingTarget
@@ -32,7 +31,7 @@ class Whose(NamedTuple):
 
     Args:
         kind: what kind of rows they are.
-        what: the body; `JOINTS`; sphere or marker of targets; of surfaces, the kind of part.
+        what: the body; the joint; sphere or marker of targets; of surfaces, the kind of part.
         unit: of the sigma.
     """
 
@@ -116,8 +115,7 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
         units = {body: ("m",) if point else ("rad", "m") for body, point in bodies.items()}
         return [Whose("body", body, unit) for body, some in units.items() for unit in some]
     if site is Site.JOINTS:
-        units = [unit for unit in ("rad", "m") if next(read(problem, unit), None) is not None]
-        return [Whose("joints", JOINTS, unit) for unit in units]
+        return list(_joints(problem))
     if site is Site.TARGET:
         there = any(isinstance(block, HangingTarget) for block in problem.blocks)
         return [Whose("target", part, "m") for part in PARTS_OF_SIGMAS] if there else []
@@ -125,10 +123,21 @@ def rows_at(problem: Problem, site: Site) -> list[Whose]:
     return [Whose("surface", part, "m") for part in SURFACE_SHARES] if meshes else []
 
 
-def read(problem: Problem, unit: str) -> Iterator[Unknown]:
-    """What encoders misreport, wherever that has a sigma in this unit."""
-    every = (u for u in problem.variables.values() if u.role is Role.JOINTS)
-    return (unknown for unknown in every if len(unknown.read(unit)))
+def readings(problem: Problem) -> Iterator[Unknown]:
+    """What encoders misreport at each stop."""
+    return (u for u in problem.variables.values() if u.role is Role.JOINTS)
+
+
+def _joints(problem: Problem) -> dict[Whose, tuple[float, float]]:
+    """Joints that are read anywhere -> the sigma of their readings, and how much of it is beyond
+    what it was at first."""
+    out: dict[Whose, tuple[float, float]] = {}
+    for unknown in readings(problem):
+        for i in np.flatnonzero(unknown.is_read):
+            joint = unknown.dofs[i]
+            found = float(unknown.sigma[i]), unknown.scatter.get(joint, 0.0)
+            out.setdefault(Whose("joints", joint, unknown.units[i]), found)
+    return out
 
 
 def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
@@ -138,10 +147,7 @@ def sigmas(problem: Problem) -> dict[Whose, tuple[float, float]]:
         for block in problem.bodies
         for unit in ("rad", "m")
     }
-    for unit in ("rad", "m"):
-        if (unknown := next(read(problem, unit), None)) is not None:
-            sigma = float(unknown.sigma[unknown.read(unit)[0]])
-            out[Whose("joints", JOINTS, unit)] = sigma, unknown.scatter.get(unit, 0.0)
+    out |= _joints(problem)
     for block in (b for b in problem.blocks if isinstance(b, HangingTarget)):
         for part, beyond in block.scatter.items():
             sigma = getattr(block, f"sigma_{part}_m")
@@ -193,9 +199,9 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
 
 def _widened(problem: Problem, whose: Whose, sd: float) -> Problem:
     """The problem with another spread of some rows."""
-    kind, what, unit = whose
+    kind, what, _ = whose
     if kind == "joints":
-        joints = {u.name: u.scattering(unit, sd) for u in read(problem, unit)}
+        joints = {u.name: u.scattering(what, sd) for u in readings(problem)}
         return replace(problem, variables=problem.variables | joints)
     if kind != "surface":
         blocks = [_block_scattering(block, whose, sd) for block in problem.blocks]

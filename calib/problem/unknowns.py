@@ -82,7 +82,8 @@ class Unknown:
         role: what it stands for.
         owner: whose it is.
         weight: robust weight of what was known before, 0 to 1.
-        scatter: unit -> how widely it scatters beyond what its sigmas in it were at first.
+        scatter: of joint readings, joint -> how widely it scatters beyond what its sigma was at
+            first.
     """
 
     name: str
@@ -120,16 +121,17 @@ class Unknown:
         """(dim,) of the rows that hold it to its mean: larger where these have less weight."""
         return self.sigma / np.sqrt(self.weight)
 
-    def read(self, unit: str) -> np.ndarray:
-        """Of joint readings, those (n,) in a unit that are neither exact nor left out."""
-        known = (self.sigma > EXACT) & (self.sigma < UNREAD)
-        return np.flatnonzero(known & (np.array(self.units) == unit))
+    @property
+    def is_read(self) -> np.ndarray:
+        """Of joint readings, (dim,) bool, which are neither exact nor left out."""
+        return (self.sigma > EXACT) & (self.sigma < UNREAD)
 
-    def scattering(self, unit: str, sd: float) -> Unknown:
-        """Joint readings with another spread beyond their sigma in this unit."""
-        sigma, mine = self.sigma.copy(), self.read(unit)
-        sigma[mine] = np.sqrt(sigma[mine] ** 2 - self.scatter.get(unit, 0.0) ** 2 + sd**2)
-        return replace(self, sigma=sigma, scatter={**self.scatter, unit: sd})
+    def scattering(self, joint: str, sd: float) -> Unknown:
+        """Joint readings, that of one joint with another spread beyond its sigma."""
+        sigma = self.sigma.copy()
+        mine = self.is_read & (np.array(self.dofs) == joint)
+        sigma[mine] = np.sqrt(sigma[mine] ** 2 - self.scatter.get(joint, 0.0) ** 2 + sd**2)
+        return replace(self, sigma=sigma, scatter={**self.scatter, joint: sd})
 
     def loosened(self, by: float) -> Unknown:
         """The same, where it may have moved by as many of its sigmas since that was known."""

@@ -12,11 +12,12 @@ import numpy as np
 from calib.effects import Effect, NotTrustedError, own_effects, read
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
+from calib.problem.spread import names_of
 from calib.problem.without import leave_out
 from calib.rig import load_rig
 from calib.runs.run import DIAGNOSIS, MODEL, SOLUTION, STATE, Run, versions
 from calib.runs.stored import FIT_AGAIN
-from calib.solve.estimate import DOFS, Start
+from calib.solve.estimate import DOFS, SD, Start
 from chains import remote
 from chains.errors import InputError
 from sensors.recording import digest
@@ -159,6 +160,10 @@ def state_of(run: Run, problem: Problem) -> dict[str, np.ndarray]:
             whole = found.shape == dofs.shape and set(unknown.dofs) <= set(dofs.tolist())
         if not whole:
             raise InputError(f"{run.folder / STATE}: its state lacks '{name}'; {FIT_AGAIN}")
+    drawn = (t for terms in problem.terms for t in terms if t.effect.by_chance)
+    for key in (key for term in drawn for key in names_of(problem, term)):
+        if f"{key}{SD}" not in state:
+            raise InputError(f"{run.folder / STATE}: its state lacks '{key}'; {FIT_AGAIN}")
     return state
 
 

@@ -21,7 +21,8 @@ from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
 from calib.residuals.surfaces import MeshSurface
 from calib.solve.added import begun
-from calib.solve.components import sds, squares, told, wider
+from calib.solve.components import squares, wider
+from calib.solve.components.told import sds, told
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progress
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph

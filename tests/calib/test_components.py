@@ -11,7 +11,9 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.spread import spread_of
 from calib.simulation import Spec, simulate
-from calib.solve.components import Checks, Told, spreads, squares
+from calib.solve.components import spreads, squares
+from calib.solve.components.checks import Checks
+from calib.solve.components.told import Told
 from calib.solve.fit import resume, solve
 
 SD, PLACE_SD = 0.7, 0.4
@@ -109,7 +111,7 @@ def test_rounding_beside_a_very_wide_spread_is_no_fault():
         np.linalg.cholesky(np.eye(40) + 1e8 * information)
     truth = axes[:, :20] @ rng.standard_normal(20)
     told = Told(information @ truth, information, np.zeros(40, int))
-    values, covariance, _ = told._given(np.full(1, 1e8))
+    values, covariance, _ = told.given(np.full(1, 1e8))
     np.testing.assert_allclose(axes[:, :20].T @ values, axes[:, :20].T @ truth, atol=0.05)
     assert np.abs(axes[:, 20:].T @ values).max() < 1.0
     assert np.linalg.eigvalsh(covariance)[0] > -1e-3
@@ -312,25 +314,26 @@ def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     [
         ("tracker_scatter", 3.0, {"base_markers.rad", "mount_markers.rad"}),
         ("tracker_scatter", 3.0, {"base_markers.m", "mount_markers.m"}),
-        ("joint_scatter", 3.0, {"joints.rad"}),
+        ("joint_scatter", 3.0, {f"joint_{i}.rad" for i in range(1, 7)}),
         ("target_scatter", 3.0, {"target/sphere.m"}),
         ("reference_scatter", 3.0, {"surface.m"}),
     ],
 )
 def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, size, keys):
-    """Bodies and joints at 24 stops each, five targets; some 70 surfaces of the mesh, of which
-    those furthest off meet no beam that is believed."""
+    """Bodies at 24 stops each, five targets; some 70 surfaces of the mesh, of which those furthest
+    off meet no beam that is believed. Of a joint all rows tell as much as 6 readings at least."""
     _, estimate = worse(effect, size)
     sigma = find(effect).sigma * size
     found = {key.partition(".")[2]: each for key, each in spreads(estimate).items()}
     for key in keys:
         sd, of = found[key]
         least = 0.7 * sigma if effect == "reference_scatter" else sigma - 3 * of
-        assert least < sd < sigma + 3 * of and 0.05 < of / sd < 0.3
+        widest = 0.6 if effect == "joint_scatter" else 0.3
+        assert least < sd < sigma + 3 * of and 0.05 < of / sd < widest
     again = squares(estimate)
     for whose, checks in again.items():
         if f"{whose.text}.{whose.unit}" in keys:
-            assert checks.total / checks.left == pytest.approx(1.0, abs=0.05)  # they fit
+            assert checks.growth() == pytest.approx(0.0, abs=0.05)  # they fit
 
 
 @pytest.fixture(scope="module")

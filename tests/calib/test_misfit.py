@@ -23,7 +23,7 @@ from calib.results.misfit import (
 )
 from calib.runs.calibrate import calibrate
 from calib.show.comparison import print_comparison
-from calib.solve.components import Checks
+from calib.solve.components.checks import Checks
 from calib.solve.fit import solve
 
 from . import broken, rigs

@@ -155,8 +155,24 @@ def test_poses_are_no_blunders_where_one_joint_scatters_more_than_all(tmp_path, 
     T = world.seen(q) * arm_worlds.exp(arm_worlds.noise(rng, poses))
     arm_worlds.save(folder, world, read, T, {}, 2e-5)
     done = search(stand_of(calibrate([folder], tmp_path / "run"), quiet), quiet)
-    assert "joint_scatter" in [found.effect.name for found in done.chance]
+    (chance,) = (found for found in done.chance if found.effect.name == "joint_scatter")
+    (worst,) = (spread for spread in chance.spreads if spread.sd > 1e-4)
+    assert worst.of == "j5" and abs(worst.sd - 1.2e-3) < 3 * worst.sigma
     assert [each.blunder.group.stop for each in done.blunders] == ["p0070"] * wild
+
+
+@pytest.mark.parametrize("joint", [None, 0])
+def test_a_tracker_that_scatters_is_no_joint_that_does_and_the_other_way_round(tmp_path, joint):
+    """Errors of six joints move a tool in as many ways as a tracker errs, a single one's in one."""
+    rng, folder, poses = np.random.default_rng(110), tmp_path / "rec", 80
+    world = arm_worlds.bent(folder, "puma560", rng)
+    read, noise = world.draw(rng, poses), arm_worlds.noise(rng, poses)
+    off = 0.0 if joint is None else 1e-3 * np.outer(rng.normal(size=poses), np.eye(6)[joint])
+    T = world.seen(read + off) * arm_worlds.exp(noise * (7.0 if joint is None else 1.0))
+    arm_worlds.save(folder, world, read, T, {}, 2e-5)
+    done = search(stand_of(calibrate([folder], tmp_path / "run", hold_out="none"), quiet), quiet)
+    name = "tracker_scatter" if joint is None else "joint_scatter"
+    assert [chance.effect.name for chance in done.chance] == [name]
 
 
 def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):

@@ -19,8 +19,7 @@ from scipy import special
 
 from calib.blunders.chance import LEVELS, POWER, after_looks, at_least
 from calib.blunders.judged import Blunder
-from calib.blunders.shifts import beside_bodies, of_poses
-from calib.diagnosis.chance.alike import UNITS, Unlike, unlike
+from calib.blunders.shifts import beside_bodies, of_poses, told_by_stop
 from calib.diagnosis.chance.at_zero import AtZero
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
@@ -29,22 +28,17 @@ from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
 from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
-from calib.solve.components import (
-    LEAST_SD,
-    Checks,
-    Sums,
-    Told,
-    sigma_beyond,
-    spreads,
-    squares,
-    told,
-)
+from calib.solve.components import Sums, sigma_beyond, spreads, squares
+from calib.solve.components.checks import Checks
+from calib.solve.components.told import LEAST_SD, Told, ToldApart, told
 from calib.solve.estimate import Estimate
 
 ALPHA_SCATTER = LEVELS["scatter by chance"]
 # Members, or checks of a body's rows, below which nothing is said of their spread.
 FEWEST_MEMBERS = 4
 SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
+# Rows of which scatter of one kind seems to be scatter of the other.
+TAKING_IN = (Site.TRACKER, Site.JOINTS)
 # Of wider rows: who scatters.
 NOUNS = {
     Site.TRACKER: "The tracker scatters",
@@ -74,7 +68,7 @@ class Spread:
     @property
     def told(self) -> str:
         """As people read it."""
-        unit = UNITS[self.unit]
+        unit = {"m": "mm", "rad": "mrad"}[self.unit]
         return f"{1e3 * self.sd:.2f} ± {1e3 * self.sigma:.2f} {unit}"
 
     def document(self, effect: str) -> dict[str, Any]:
@@ -94,7 +88,6 @@ class Chance:
         p_value: how often as much is seen where there is none.
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
-        unlike: of joint readings, how much more some joints scatter than others, where they do.
     """
 
     effect: Scatter
@@ -103,7 +96,6 @@ class Chance:
     p_value: float
     detectable: float
     rivals: Sequence[str] = ()
-    unlike: Sequence[Unlike] = ()
 
     @property
     def p_adjusted(self) -> float:
@@ -118,10 +110,8 @@ class Chance:
     def beside(self, estimate: Estimate) -> Chance:
         """The same as a fit has it that it is part of, tested beside all else in that."""
         if self.effect.widens:
-            again = _of_rows(self.effect, squares(estimate), estimate.problem) or self
-            asked = ("rad", "m") if self.effect.site is Site.JOINTS else ()
-            each = [found for unit in asked if (found := unlike(estimate, unit))]
-            return replace(again, rivals=self.rivals, unlike=each)
+            again = _of_rows(self.effect, squares(estimate), estimate.problem)
+            return replace(again, rivals=self.rivals) if again else self
         known, found = spreads(estimate), []
         for unknown in by_chance(estimate.problem):
             if unknown.owner.effect == self.effect.name:  # of whichever rig
@@ -168,7 +158,6 @@ class Chance:
             "indistinguishable_from": list(self.rivals),
             "rivals": [],
             "matters": None,
-            "unlike": [each for some in self.unlike for each in some.document()],
         }
 
     def _name(self, spread: Spread) -> str:
@@ -203,11 +192,10 @@ class Chance:
             if self.rivals
             else ""
         )
-        apart = "".join(f"{each.sentence} " for each in self.unlike)
         return (
             f"{what}; random as far as these data show (p = {self.p_adjusted:.1g}). {rivals}"
-            f"{apart}{name} widens every sigma by that; it predicts nothing at another {each}, so "
-            "the held-out error does not fall."
+            f"{name} widens every sigma by that; it predicts nothing at another {each}, so the "
+            "held-out error does not fall."
         )
 
 
@@ -297,14 +285,36 @@ def rows_by_chance(
             seen.setdefault(Whose("body", shift.group.what, unit), []).append(squares_there)
     sums = {body: Checks.alone(*np.sum(mine, axis=0)) for body, mine in seen.items()}
     sites = {effect.site for effect in effects} - {Site.TRACKER}
+    wild = [b.group for b in blunders if b.found]
     if whose := {each for site in sites for each in rows_at(problem, site)}:
-        sums |= beside_bodies(whole, problem, whose, [b.group for b in blunders if b.found])
-    found = (_of_rows(effect, sums, problem) for effect in effects)
-    return [chance for chance in found if chance is not None]
+        sums |= beside_bodies(whole, problem, whose, wild)
+    tests = (_of_rows(effect, sums, problem) for effect in effects)
+    found = [chance for chance in tests if chance is not None]
+    if sum(chance.found and chance.effect.site in TAKING_IN for chance in found) < 2:
+        return found
+    told = told_by_stop(whole, problem, {w: i for i, w in enumerate(_taking_in(problem))}, wild)
+    return [_by_likelihood(chance, told, problem) for chance in found]
+
+
+def _taking_in(problem: Problem) -> list[Whose]:
+    return [whose for site in TAKING_IN for whose in rows_at(problem, site)]
+
+
+def _by_likelihood(chance: Chance, told: ToldApart, problem: Problem) -> Chance:
+    """The same with its likelihood ratio over rows of bodies and joints, if it is of these: what
+    others would take in, and weights that a fit without it gave, make no difference."""
+    if chance.effect.site not in TAKING_IN:
+        return chance
+    mine, every = rows_at(problem, chance.effect.site), _taking_in(problem)
+    of_it = told.of(*(every.index(whose) for whose in mine))
+    ratio = of_it.statistic(of_it.spread(np.ones(len(mine))))
+    return replace(chance, statistic=ratio)
 
 
 def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     """The test that rows have the variance that is stated, as `Checks` have it."""
+    if effect.site is Site.JOINTS:
+        return _of_readings(effect, sums, problem)
     known, spreads, p, statistic, detectable = sigmas(problem), [], [], 0.0, np.inf
     mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
     checked = {whose: sums[whose] for whose in mine if sums[whose].left >= FEWEST_MEMBERS}
@@ -319,11 +329,46 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
         p.append(float(special.chdtrc(at_first.dof, at_first.scaled)))
         statistic += at_first.statistic(grown)
         if whose.unit == effect.leading:
-            limit = special.chdtri(at_first.dof, ALPHA_SCATTER / SCATTER_LOOKS / len(checked))
-            enough = limit / special.chdtri(at_first.dof, POWER) - 1.0
-            share = at_first.told / at_first.left
-            detectable = min(detectable, float(np.sqrt(variance * enough / share)))
+            detectable = min(detectable, _detectable(at_first, variance, len(checked)))
     if not any(spread.unit == effect.leading for spread in spreads):
         return None
     p_value = float(after_looks(min(p), len(p)))
     return Chance(effect, spreads, statistic, p_value=p_value, detectable=detectable)
+
+
+def _of_readings(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
+    """The same of joint readings: of all of them together, and of each joint's."""
+    known = sigmas(problem)
+    mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
+    if not any(whose.unit == effect.leading for whose in mine):
+        return None
+    among = sums[mine[0]].among
+    sigma, beyond = np.array([known[whose] for whose in mine]).T
+    first = np.sqrt(sigma**2 - beyond**2)
+    every, each = among.checks(first / sigma)
+    if every.left < FEWEST_MEMBERS:
+        return None
+    of_joints = [(c, s) for c, s in zip(each, first, strict=True) if c.left >= FEWEST_MEMBERS]
+    looked = [(every, float(np.median(first))), *of_joints]
+    total = np.maximum(among.likeliest * sigma, first)
+    ratio = among.told.statistic(total / sigma) - among.told.statistic(first / sigma)
+    p = [special.chdtrc(checks.dof, checks.scaled) for checks, _ in looked]
+    sd, of_total = np.sqrt(total**2 - first**2), among.sigma * sigma
+    of_sd = map(sigma_beyond, sd.tolist(), (2.0 * total * of_total).tolist())
+    return Chance(
+        effect,
+        spreads=[
+            Spread(of=whose.text, unit=whose.unit, sd=float(one), sigma=of, who=whose.what)
+            for whose, one, of in zip(mine, sd, of_sd, strict=True)
+        ],
+        statistic=float(ratio),
+        p_value=float(after_looks(min(p), len(p))),
+        detectable=min(_detectable(checks, s**2, len(looked)) for checks, s in looked),
+    )
+
+
+def _detectable(checks: Checks, variance: float, looks: int) -> float:
+    """The sd beyond rows' variance that is found with 80 % power, of so many that are looked at."""
+    limit = special.chdtri(checks.dof, ALPHA_SCATTER / SCATTER_LOOKS / looks)
+    enough = limit / special.chdtri(checks.dof, POWER) - 1.0
+    return float(np.sqrt(variance * enough * checks.left / checks.told))

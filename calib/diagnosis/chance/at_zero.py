@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import POWER
-from calib.solve.components import DIRECTION_SEEN, Told
+from calib.solve.components.told import DIRECTION_SEEN, Told
 
 SCATTER_DRAWS = 2000  # of chance: their mean, from which p-values follow, is known to some 5 %
 GRID = np.append(0.0, np.geomspace(1e-3, 1e3, 61))  # of d, in units of the mean 1 / l

@@ -1,0 +1,178 @@
+"""What all rows say of values that chance draws anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from calib.linear.elimination import inverse_and_log_det
+from calib.problem.spread import spread_keys
+from calib.problem.unknowns import Unknown
+
+PRECISE = {"ftol": 1e-15, "gtol": 1e-7}  # of twice a log-likelihood: sds to some 1e-6 of theirs
+LEAST_SD = 1e-3  # of the sd that a group starts from: what is smaller counts as none
+LARGEST_SD = 1e6  # times that: far from an optimum scores are of any size, and squares overflow
+DIRECTION_SEEN = 1e-9  # of the largest information, below which a direction of values is not seen
+
+
+@dataclass(frozen=True)
+class Told:
+    """What all rows but their priors say of values by chance (Q,).
+
+    Args:
+        score: (Q,) at zero, all else being estimated there.
+        information: (Q, Q), all else being estimated.
+        group: (Q,) which group each belongs to, from 0.
+    """
+
+    score: np.ndarray
+    information: np.ndarray
+    group: np.ndarray
+
+    @classmethod
+    def fitted(
+        cls, values: np.ndarray, covariance: np.ndarray, variance: np.ndarray, group: np.ndarray
+    ) -> Told:
+        """From the values (Q,) as fitted, their covariance (Q, Q) and the variances (Q,) that they
+        were held by; the group (Q,) of each is a number from 0."""
+        root = np.sqrt(variance)
+        scaled = np.linalg.inv(covariance / np.outer(root, root))
+        information = (scaled - np.eye(len(values))) / np.outer(root, root)
+        score = (scaled @ (values / root)) / root
+        return cls(score, (information + information.T) / 2, group)
+
+    def spread(self, start: np.ndarray) -> np.ndarray:
+        """The sd (G,) of each group.
+
+        Args:
+            start: (G,) sd to start from.
+        """
+        return _likeliest(self.unlikely, start)
+
+    def unlikely(self, log_variance: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the restricted log-likelihood, twice, and its derivative (G,) by the logs of the
+        variances: nought where the squares of the values are as many variances as all rows tell of
+        (MacKay 1992)."""
+        variance = np.exp(log_variance)
+        values, covariance, log_det = self.given(variance)
+        count, known, square = (
+            np.bincount(self.group, each, minlength=len(variance))
+            for each in (None, np.diag(covariance), np.square(values))
+        )
+        slope = count - (known + square) / variance
+        return log_det - float(self.score @ values), slope
+
+    def of(self, *groups: int) -> Told:
+        """Of one group, or of some, all others being 0; numbered from 0 as they are given."""
+        at = np.flatnonzero(np.isin(self.group, groups))
+        number = np.array([groups.index(group) for group in self.group[at].tolist()], int)
+        return Told(self.score[at], self.information[np.ix_(at, at)], number)
+
+    def statistic(self, sd: np.ndarray) -> float:
+        """Twice the log of the likelihood ratio of the sds (G,) against none."""
+        values, _, log_det = self.given(np.square(sd))
+        return float(self.score @ values) - log_det
+
+    def given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """The values (Q,) and their covariance, given the variances of the groups; and by how much
+        the log of the determinant of what is told of them grows."""
+        root = np.sqrt(variance)[self.group]
+        inner = np.eye(len(root)) + root[:, None] * self.information * root
+        of_inner, log_det = inverse_and_log_det(inner)
+        covariance = root[:, None] * of_inner * root
+        return covariance @ self.score, covariance, log_det
+
+    def sigma(self, sd: np.ndarray) -> np.ndarray:
+        """Of the sds (G,), from the expected information of the variances: ``tr(P E_i P E_j) / 2``
+        with ``P = M - M C M``; of one that is no more than that, the sd of such a variance."""
+        return _sigma(sd, self.of_variances(sd))
+
+    def of_variances(self, sd: np.ndarray) -> np.ndarray:
+        """Expected information (G, G) of the variances at these sds (G,)."""
+        _, covariance, _ = self.given(np.square(sd))
+        P = self.information - self.information @ covariance @ self.information
+        sums = np.zeros((len(sd), len(sd)))
+        np.add.at(sums, (self.group[:, None], self.group), np.square(P) / 2)
+        return sums
+
+
+@dataclass(frozen=True)
+class ToldApart:
+    """The same of values in parts between which next to nothing goes together.
+
+    Args:
+        parts: what is told of each; their groups are the same.
+    """
+
+    parts: Sequence[Told]
+
+    def of(self, *groups: int) -> ToldApart:
+        """As of `Told`."""
+        return ToldApart([part.of(*groups) for part in self.parts])
+
+    def spread(self, start: np.ndarray) -> np.ndarray:
+        """As of `Told`."""
+
+        def unlikely(log_variance: np.ndarray) -> tuple[float, np.ndarray]:
+            values, slopes = zip(*(part.unlikely(log_variance) for part in self.parts), strict=True)
+            return sum(values), np.sum(slopes, axis=0)
+
+        return _likeliest(unlikely, start)
+
+    def statistic(self, sd: np.ndarray) -> float:
+        """As of `Told`."""
+        return sum(part.statistic(sd) for part in self.parts)
+
+    def sigma(self, sd: np.ndarray) -> np.ndarray:
+        """As of `Told`."""
+        return _sigma(sd, np.sum([part.of_variances(sd) for part in self.parts], axis=0))
+
+
+def _likeliest(
+    unlikely: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray
+) -> np.ndarray:
+    """The sd (G,) of each group, from a start (G,)."""
+    first = 2.0 * np.log(start)
+    ends = [first + 2.0 * np.log(times) for times in (LEAST_SD, LARGEST_SD)]
+    bounds = np.stack(ends, axis=1)
+    best = minimize(unlikely, first, jac=True, method="L-BFGS-B", bounds=bounds, options=PRECISE)
+    return np.exp(best.x / 2.0)
+
+
+def _sigma(sd: np.ndarray, of_variances: np.ndarray) -> np.ndarray:
+    """Of sds (G,), from the information (G, G) of their variances."""
+    scale = np.sqrt(np.maximum(np.diag(of_variances), 1e-300))
+    inverse = np.linalg.pinv(of_variances / np.outer(scale, scale)) / np.outer(scale, scale)
+    of_variance = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    beyond = np.sqrt(np.square(sd) + of_variance) - sd
+    return np.where(of_variance < 2 * np.square(sd), of_variance / (2 * sd), beyond)
+
+
+def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:
+    """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted."""
+    return Told.fitted(
+        np.concatenate([values[u.name] for u in some]),
+        covariance,
+        np.square(np.concatenate([u.sigma for u in some])),
+        groups(some),
+    )
+
+
+def groups(some: Sequence[Unknown]) -> np.ndarray:
+    """Which spread (Q,) each value of some unknowns by chance has, in the order of their keys."""
+    out, count = [], 0
+    for unknown in some:
+        of = np.zeros(unknown.dim, int)
+        for at in spread_keys(unknown).values():
+            of[at] = count
+            count += 1
+        out.append(of)
+    return np.concatenate(out)
+
+
+def sds(some: Sequence[Unknown]) -> dict[str, float]:
+    """Key of each spread of some unknowns by chance -> what it is."""
+    return {key: float(u.sigma[at[0]]) for u in some for key, at in spread_keys(u).items()}
