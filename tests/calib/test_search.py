@@ -161,6 +161,22 @@ def test_poses_are_no_blunders_where_one_joint_scatters_more_than_all(tmp_path, 
     assert [each.blunder.group.stop for each in done.blunders] == ["p0070"] * wild
 
 
+def test_effects_see_bodies_where_the_model_has_them(tmp_path):
+    """A scale of what was measured would shrink its errors as well: of a tracker that is worse than
+    its sigma it was named, 7 % of it."""
+    rng, folder, poses = np.random.default_rng(7), tmp_path / "rec", 80
+    world = arm_worlds.bent(folder, "puma560", rng)
+    read = world.draw(rng, poses)
+    seen, noise = world.seen(read), arm_worlds.noise(rng, poses)
+    arm_worlds.save(folder, world, read, seen * arm_worlds.exp(7.0 * noise), {}, 2e-5)
+    stand = stand_of(calibrate([folder], tmp_path / "run", hold_out="none"), quiet)
+    problem = stand.problem_of(stand.model.plus((find("optitrack_scale"),)))
+    shift = [np.linalg.norm(b.bases["optitrack_scale"][0, 3:, 0]) for b in problem.bodies]
+    measured = [np.linalg.norm(b.measured[0, :3, 3]) for b in problem.bodies]
+    true = np.linalg.norm(seen.translation, axis=1)
+    assert np.std(shift - true) < 0.5 * np.std(measured - true)
+
+
 @pytest.mark.parametrize("joint", [None, 0])
 def test_a_tracker_that_scatters_is_no_joint_that_does_and_the_other_way_round(tmp_path, joint):
     """Errors of six joints move a tool in as many ways as a tracker errs, a single one's in one."""
