@@ -49,7 +49,8 @@ calib.fit([monday], out / "monday-run", hold_out="none")
 run = calib.fit([friday], out / "friday-run", hold_out="none", prior=out / "monday-run")
 
 for link in run.summary["links"]:
-    print(f"{link['name']:18}", "has moved" if link["moved"] else "has not moved")
+    held = "may have moved instead" if link["freed"] else "has not moved"
+    print(f"{link['name']:18}", "has moved" if link["moved"] else held)
     if link["moved"]:
         columns = (link[key] for key in ("parameters", "units", "change", "sigma"))
         for name, unit, change, sigma in zip(*columns, strict=True):
