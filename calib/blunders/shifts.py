@@ -28,6 +28,7 @@ from calib.blunders.rows import GroupRows, group_rows, scan_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.spread import Whose
+from calib.problem.unknowns import is_read
 from calib.residuals.groups import ALONG_BEAMS, Group
 from calib.residuals.store import drawn_evenly
 from calib.solve.components import Sums, squares_beside_bodies
@@ -36,7 +37,7 @@ from calib.solve.components.told import Told, ToldApart
 # Scans that tell how places of the LiDAR scatter, of more: a choice. So many tell it to 1 part in
 # 24, and the matrix over 6 unknowns of each is factored in 2 s, that of 1,000 in 40 s.
 TELLING_SCANS = 300
-ASKED = {"body", "joints"}  # kinds of groups whose scatter is compared
+TOLD_TOGETHER = {"body", "joints"}  # kinds of groups whose scatter is compared
 Squares = Mapping[str, tuple[float, float]]
 
 
@@ -166,14 +167,16 @@ def told_by_stop(
 
 
 def _whose(rows: GroupRows) -> list[Whose | None]:
-    """Whose each row (m,) is, of a body or a joint; None of others."""
+    """Whose each row (m,) is, of a body or a joint that is read; None of others."""
     kinds = {group.kind for group in rows.groups}
-    if rows.information is not None or not kinds <= ASKED:
+    if rows.information is not None or not kinds <= TOLD_TOGETHER:
         return [None] * len(rows.A)
     (kind,) = kinds
-    what = next(iter(rows.groups)).what
-    each = zip(rows.axes, rows.units, strict=True)
-    return [Whose(kind, what if kind == "body" else axis, unit) for axis, unit in each]
+    what, known = next(iter(rows.groups)).what, is_read(np.abs(rows.sigma))
+    if kind == "body":
+        return [Whose("body", what, unit) for unit in rows.units]
+    each = zip(rows.axes, rows.units, known, strict=True)
+    return [Whose("joints", axis, unit) if there else None for axis, unit, there in each]
 
 
 def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:

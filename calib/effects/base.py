@@ -148,6 +148,12 @@ class Effect(ABC):
         return self.site is Site.REFERENCE and self.covariates == ("point_m",)
 
     @property
+    def goes_with_time(self) -> bool:
+        """Whether it is of the day, as a drift, and not of the rig. The order of readings in time,
+        which a gear's play depends on, is no drift."""
+        return "elapsed_s" in self.covariates or "time_s" in self.seen
+
+    @property
     def has_derivative_by_shape(self) -> bool:
         """Whether its shape can be estimated like a parameter, once it is near."""
         return bool(self.shape_name) and not self.whole and not self.jumps

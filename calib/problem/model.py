@@ -26,7 +26,6 @@ from sensors.documents import nearest
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 
-TIME = "elapsed_s"  # since a recording began
 ROWS_A_PARAMETER = 10  # of an arm, for its whole geometry to be estimated; see `default_effects`
 
 
@@ -245,7 +244,7 @@ def default_effects(
             most = max(most, sum(p.sigma > 0 for effect in arm for p in effect.params(rig)))
     told = 0 < ROWS_A_PARAMETER * most <= rows
     usual = (*effects.DEFAULT, *(n for n in effects.GEOMETRY if told and n not in effects.DEFAULT))
-    lasting = (effect for effect in known if TIME not in effect.covariates)
+    lasting = (effect for effect in known if not effect.goes_with_time)
     return (*usual, *(effect for effect in lasting if effect.name not in usual))
 
 
@@ -342,7 +341,6 @@ class Source:
         if self.rig.levels:
             columns["up"] = up_in_root(self.rig, recording)
         return {**columns, **recording.covariates}
-
 
     def seen_at(self, T_world_body: np.ndarray) -> Source:
         """The same where effects see bodies at these poses (K, B, 4, 4); what scans were read stay

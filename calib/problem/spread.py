@@ -19,7 +19,7 @@ from calib.effects import Site
 from calib.forward import Term
 from calib.problem.problem import Block, Problem
 from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
-from calib.problem.unknowns import Role, Unknown
+from calib.problem.unknowns import Role, Unknown, is_read
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.targets import PARTS_OF_SIGMAS, HangingTarget
@@ -133,7 +133,7 @@ def _joints(problem: Problem) -> dict[Whose, tuple[float, float]]:
     what it was at first."""
     out: dict[Whose, tuple[float, float]] = {}
     for unknown in readings(problem):
-        for i in np.flatnonzero(unknown.is_read):
+        for i in np.flatnonzero(is_read(unknown.sigma)):
             joint = unknown.dofs[i]
             found = float(unknown.sigma[i]), unknown.scatter.get(joint, 0.0)
             out.setdefault(Whose("joints", joint, unknown.units[i]), found)
@@ -199,9 +199,9 @@ def with_spread(problem: Problem, spread: Mapping[str, float], settled: float = 
 
 def _widened(problem: Problem, whose: Whose, sd: float) -> Problem:
     """The problem with another spread of some rows."""
-    kind, what, _ = whose
+    kind, what, unit = whose
     if kind == "joints":
-        joints = {u.name: u.scattering(what, sd) for u in readings(problem)}
+        joints = {u.name: u.scattering(what, unit, sd) for u in readings(problem)}
         return replace(problem, variables=problem.variables | joints)
     if kind != "surface":
         blocks = [_block_scattering(block, whose, sd) for block in problem.blocks]

@@ -17,6 +17,7 @@ UnknownKind = Literal["vector", "pose"]
 UNKNOWN_POSE = np.repeat([3.0, 10.0], 3)
 POSE_UNITS = ("rad",) * 3 + ("m",) * 3
 UNREAD = 1.0  # rad or m: a joint that nothing reads at a stop
+WIDEST_READ = 0.5 * UNREAD  # by which joint readings may scatter, with any sigma of their own
 EXACT = 1e-7  # rad or m: an encoder without error beside one that is left out
 
 
@@ -121,15 +122,19 @@ class Unknown:
         """(dim,) of the rows that hold it to its mean: larger where these have less weight."""
         return self.sigma / np.sqrt(self.weight)
 
-    @property
-    def is_read(self) -> np.ndarray:
-        """Of joint readings, (dim,) bool, which are neither exact nor left out."""
-        return (self.sigma > EXACT) & (self.sigma < UNREAD)
+    def reads(self, joint: str, unit: str) -> np.ndarray:
+        """Of joint readings, (dim,) bool, which are of a joint in this unit, and neither exact nor
+        left out."""
+        mine = zip(self.dofs, self.units, strict=True)
+        return is_read(self.sigma) & [(dof, of) == (joint, unit) for dof, of in mine]
 
-    def scattering(self, joint: str, sd: float) -> Unknown:
-        """Joint readings, that of one joint with another spread beyond its sigma."""
-        sigma = self.sigma.copy()
-        mine = self.is_read & (np.array(self.dofs) == joint)
+    def scattering(self, joint: str, unit: str, sd: float) -> Unknown:
+        """Joint readings, that of one joint with another spread beyond its sigma, at most so wide
+        that it still counts as read."""
+        sigma, mine = self.sigma.copy(), self.reads(joint, unit)
+        if not mine.any():
+            return self
+        sd = min(sd, WIDEST_READ)
         sigma[mine] = np.sqrt(sigma[mine] ** 2 - self.scatter.get(joint, 0.0) ** 2 + sd**2)
         return replace(self, sigma=sigma, scatter={**self.scatter, joint: sd})
 
@@ -144,6 +149,11 @@ class Unknown:
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """How a value b differs from a, as a tangent (dim,) at a."""
         return se3.log(se3.inverse(a) @ b) if self.kind == "pose" else b - a
+
+
+def is_read(sigma: np.ndarray) -> np.ndarray:
+    """Of joint readings of these sigmas (n,), which are neither exact nor left out."""
+    return (sigma > EXACT) & (sigma < UNREAD)
 
 
 def pose_unknown(

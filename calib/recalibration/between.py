@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from calib.results.errors import errors_at
 from calib.results.intervals import intervals
 from calib.results.sigmas import widened
 from calib.results.solution import Solution, solution_of
-from calib.solve.fit import Progress, solve
+from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
 
@@ -34,7 +35,7 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
         progress: as of `calib.solve.fit.solve`.
     """
     chance = {e.name for e in last.model.effects if e.by_chance} - set(stand.model.names)
-    model = last.model.minus(list(chance))
+    model = replace(last.model.minus(list(chance)), moved={})
     named = dict(zip(labels(last.sources), last.sources, strict=True))
     of_rigs: dict[str, list[str]] = {}
     for label, source in named.items():
@@ -64,7 +65,7 @@ def _alone(model: Model, source: Source, progress: Progress) -> Solution | None:
     except InputError:
         return None
     seen = errors_at(estimate.problem, estimate.values)
-    known = widened(intervals(estimate, progress), estimate, seen)
+    known = widened(intervals(shapes_freed(estimate, model), progress), estimate, seen)
     return solution_of(problem, estimate, known) if estimate.converged else None
 
 

@@ -18,7 +18,8 @@ ALARM = 0.01  # chance that anything is called moved when nothing has
 # Odds by which one link explains better than another, from which on it is named alone: "strong"
 # evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
 STRONG_ODDS = 20.0
-MOST_FITS = 4  # of one recalibration: one where nothing moved, two where data stay as they are
+# Of one recalibration, until it settles: one where nothing moved, two where data stay as they are.
+MOST_FITS = 4
 
 
 class _Moves(NamedTuple):
@@ -69,6 +70,8 @@ def let_go(
         fits.append(free)
         last = len(fits) == MOST_FITS - 1 or any(_alike(found, earlier) for earlier in fits)
         both = {n: max(found.get(n, 0.0), free.get(n, 0.0)) for n in found | free}
+        if last and _alike(both, free):
+            break
         free = both if last else found
     data = NewerData.of(held, now.at_least)
     moves = _Moves.of(prior, data, limit)

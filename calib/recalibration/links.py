@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.chance import at_least
+from calib.results.outstanding import freedoms
 
 
 @dataclass(frozen=True)
@@ -65,16 +66,8 @@ def since(links: Sequence[Link], earlier: Mapping[str, Any]) -> dict[str, Any]:
     return {"links": [link.document() for link in links], "moved_since_cad": far}
 
 
-def freedoms(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The links that a fit from an earlier run let go, each with by how many of CAD's sigmas: they
-    moved since, or may have in place of one that did. Earlier versions let go by one sigma what had
-    moved."""
-    links = summary.get("links", ())
-    found = {link["name"]: link.get("freed", float(link["moved"])) for link in links}
-    return {name: times for name, times in found.items() if times}
-
-
 def moved_since_cad(summary: Mapping[str, Any]) -> dict[str, float]:
-    """The same over all runs, from one to the next, since the one that knew CAD alone: CAD does not
-    tell where these are now. Earlier versions told of the last alone."""
+    """The links that were let go by any run, from one to the next, since the one that knew CAD
+    alone, each with by how many of its sigmas: it does not tell where they are now. Earlier
+    versions told of the last run alone."""
     return dict(summary.get("moved_since_cad", freedoms(summary)))

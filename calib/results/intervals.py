@@ -108,11 +108,32 @@ class Intervals:
     def over(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray:
         """Joint covariance of unknowns of the estimate, in the order given. What the graph does not
         hold, as one stop alone has it, is as well known as by C."""
-        known, found = estimate.problem.variables, self.least**2 * estimate.covariance_of(names)
+        known, least = estimate.problem.variables, self.least**2
+        found = least * estimate.covariance_of(names)
+        found -= (least - 1.0) * self._due_to_earlier(estimate, names)
         held = np.repeat([name in self.names for name in names], [known[n].dim for n in names])
         some = self.of([name for name in names if name in self.names])
-        found[np.ix_(held, held)] += some.covariance - self.least**2 * some.graph
+        as_least = least * some.graph - (least - 1.0) * some.earlier
+        found[np.ix_(held, held)] += some.covariance - as_least
         return found
+
+    def _due_to_earlier(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray | float:
+        """The part of the joint covariance of unknowns of the estimate that is due to errors of an
+        earlier run: of those that the graph does not hold, by how they go with what it holds."""
+        if not self.earlier.any():
+            return 0.0
+        if all(name in self.names for name in names):
+            return self.of(names).earlier
+        every = [*names, *(name for name in self.names if name not in names)]
+        dims = [estimate.problem.variables[name].dim for name in every]
+        ends = dict(zip(every, np.cumsum(dims).tolist(), strict=True))
+        pairs = zip(self.names, self.dims, strict=True)
+        at = np.concatenate([np.arange(ends[name] - dim, ends[name]) for name, dim in pairs])
+        mine = np.arange(sum(dims[: len(names)]))
+        sigma = np.sqrt(np.diag(self.graph))
+        across = estimate.covariance_of(every)[np.ix_(mine, at)] / sigma
+        by = np.linalg.solve(self.graph / np.outer(sigma, sigma), across.T).T / sigma
+        return by @ self.earlier @ by.T
 
     def together(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray:
         """The same for what depends on all of them together, as a place does.

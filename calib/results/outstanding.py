@@ -119,9 +119,23 @@ def _groups_told(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _moves_told(summary: Mapping[str, Any]) -> Iterator[str]:
+    known: set[str] = set()
+    if "moved_since_cad" not in summary:  # of an earlier version, whose moves are in CAD's sigmas
+        freed = freedoms(summary)
+        for link in (link for link in summary.get("links", ()) if link["name"] in freed):
+            known |= {link["name"], *(f"{link['name']}.{p}" for p in link["parameters"])}
     for name, move in moves(summary).items():
-        if move["move_sigmas"] > FAR_FROM_CAD:
+        if move["move_sigmas"] > FAR_FROM_CAD and name not in known:
             yield move_told(name, move)
+
+
+def freedoms(summary: Mapping[str, Any]) -> dict[str, float]:
+    """The links that a fit from an earlier run let go, each with by how many of CAD's sigmas: they
+    moved since, or may have in place of one that did. Earlier versions let go by one sigma what had
+    moved."""
+    links = summary.get("links", ())
+    found = {link["name"]: link.get("freed", float(link["moved"])) for link in links}
+    return {name: times for name, times in found.items() if times}
 
 
 def _told(lines: Iterator[str]) -> list[str]:

@@ -210,7 +210,7 @@ def _fit(
     """Estimate, judge by what was held out, and write the run."""
     began, progress = time.monotonic(), staged(progress, FIT)
     before = Run.open(choices.prior) if choices.prior else None
-    problem = problems.build(sources, model)
+    problem = _problem(sources, model, choices)
     held = earlier(problem, before.solution) if before else None
     links: list[Link] = []
     if held is None:
@@ -254,6 +254,19 @@ def _fit(
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
+
+
+def _problem(sources: Sequence[Source], model: Model, choices: _Choices) -> Problem:
+    """What is to be solved; what an effect lacks may be asked for by the run that is the prior."""
+    try:
+        return problems.build(sources, model)
+    except InputError as error:
+        if not choices.prior or choices.grown_from:
+            raise
+        raise InputError(
+            f"{error} (Without --effects the model has the effects of --prior {choices.prior}; "
+            "with it, those that you name.)"
+        ) from None
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:

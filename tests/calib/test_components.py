@@ -10,20 +10,16 @@ from calib.effects import CATALOGUE, find
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.spread import spread_of
-from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import stand_of
 from calib.simulation import Spec, simulate
 from calib.solve.components import spreads, squares
 from calib.solve.components.checks import Checks
 from calib.solve.components.told import Told
 from calib.solve.fit import resume, solve
-from chains.errors import InputError
 
 SD, PLACE_SD = 0.7, 0.4
 SPEC = Spec(
     lidar="hesai_pandarxt32", locations=6, stops_per_location=4, column_step=100, world_seed=5
 )
-
 
 SPARSE = {"column_step": 200}  # where the scans need tell no more than where the LiDAR was
 
@@ -361,18 +357,6 @@ def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
     problem = build([source], Model().plus([find(effect)]))
     again = resume(problem, estimate.start)
     assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
-
-
-def test_a_run_whose_scatter_was_one_number_is_to_be_fitted_again(worse, tmp_path):
-    """As earlier versions had it, of all joints."""
-    source, _ = worse("joint_scatter", 3.0)
-    model = Model().plus([find("joint_scatter")])
-    run = calibrate([source.recording.folder], tmp_path / "run", model, hold_out="none")
-    state = {n: v for n, v in run.state().items() if not n.startswith("joint_scatter.")}
-    state["joint_scatter.joints.rad.sd"] = np.float64(6e-4)
-    np.savez(run.folder / "state.npz", **{f"state/{n}": v for n, v in state.items()})
-    with pytest.raises(InputError, match=r"lacks 'joint_scatter\.joint_1\.rad'; fit the run again"):
-        stand_of(run, lambda *told: None)
 
 
 @pytest.mark.slow

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from calib.problem.model import Model
+from calib.effects import find
+from calib.problem.model import Model, default_effects
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown, pose_unknown
 from calib.recalibration import refit
 from calib.recalibration.letgo import let_go
-from calib.recalibration.links import freedoms
 from calib.recalibration.newer import NewerData
 from calib.recalibration.prior import change as change_of
 from calib.results.intervals import Intervals
+from calib.results.outstanding import freedoms
 from chains import se3
 
 NAMES = ("mount", "lidar", "arm", "unseen")
@@ -225,4 +226,32 @@ def test_of_links_that_are_found_in_turn_both_are_let_go():
 
     found = let_go(prior, fit)
     assert asked == [(), ("one",), ("other",), ("one", "other")]
-    assert all(link.freed for link in found if link.moved)
+    assert [link.moved for link in found] == [True, True] and all(link.freed for link in found)
+
+
+@pytest.mark.parametrize(("times", "held"), [(1.0, False), (3.0, True)])
+def test_what_larger_residuals_explain_has_not_moved(times, held):
+    """A change of 6 sigmas, where residuals are so many times larger than their sigmas allow."""
+    links = [linked(n, np.ones(1)) for n in ("one", "other")]
+    prior = JointPrior(links, {}, 1e-4 * np.eye(2))
+    data = NewerData(
+        1e4 * np.eye(2), 1e4 * np.array([6.0e-2 * np.sqrt(2.0), 0.0]), np.zeros((2, 2))
+    )
+    asked = []
+
+    def fit(held):
+        asked.append(held.covariance[0, 0] > 0.1)
+        now = data.fitted(held)
+        own = now.graph @ data.information @ now.graph
+        return now._replace(widened=now.graph + (times**2 - 1.0) * own)
+
+    one, other = let_go(prior, fit)
+    assert not other.moved and one.moved is not held and bool(one.freed) is not held
+    assert asked == [False, True] + [False] * held  # once more, with nothing let go
+
+
+def test_an_effect_of_the_day_is_not_of_the_next():
+    known = [find("arm_backlash"), find("warmup_drift"), find("tracker_creep"), find("range_scale")]
+    names = [getattr(each, "name", each) for each in default_effects([], known)]
+    assert {"arm_backlash", "range_scale"} <= set(names) and len(names) == len(set(names))
+    assert not {"warmup_drift", "tracker_creep"} & set(names)

@@ -177,44 +177,6 @@ def test_effects_see_bodies_where_the_model_has_them(tmp_path):
     assert np.std(shift - true) < 0.5 * np.std(measured - true)
 
 
-@pytest.mark.parametrize("joint", [None, 0])
-def test_a_tracker_that_scatters_is_no_joint_that_does_and_the_other_way_round(tmp_path, joint):
-    """Errors of six joints move a tool in as many ways as a tracker errs, a single one's in one."""
-    rng, folder, poses = np.random.default_rng(110), tmp_path / "rec", 80
-    world = arm_worlds.bent(folder, "puma560", rng)
-    read, noise = world.draw(rng, poses), arm_worlds.noise(rng, poses)
-    off = 0.0 if joint is None else 1e-3 * np.outer(rng.normal(size=poses), np.eye(6)[joint])
-    T = world.seen(read + off) * arm_worlds.exp(noise * (7.0 if joint is None else 1.0))
-    arm_worlds.save(folder, world, read, T, {}, 2e-5)
-    done = search(stand_of(calibrate([folder], tmp_path / "run", hold_out="none"), quiet), quiet)
-    name = "tracker_scatter" if joint is None else "joint_scatter"
-    assert [chance.effect.name for chance in done.chance] == [name]
-
-
-def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
-    """A mount is of one rig, so its slip is estimated for each; the time, for both together."""
-    rng, poses, first = np.random.default_rng(3), 60, 33
-    time_s = np.arange(poses) * 12.0
-    world = arm_worlds.bent(tmp_path / "one", "ur10", rng)
-    shutil.copytree(tmp_path / "one", tmp_path / "two")
-    for rig, size_m in (("one", 1e-3), ("two", -2e-3)):
-        folder = tmp_path / rig
-        read = world.draw(rng, poses)
-        slip = size_m * np.outer(np.arange(poses) >= first, np.eye(6)[3])
-        T = world.seen(read) * arm_worlds.exp(slip) * arm_worlds.exp(arm_worlds.noise(rng, poses))
-        arm_worlds.save(folder, world, read, T, {"time_s": time_s})
-        path = folder / "rig.yaml"
-        path.write_text(path.read_text("utf-8").replace("name: arm", f"name: {rig}"), "utf-8")
-    model = Model((*GEOMETRY, "mount_slip@366"))  # two stops early
-    run = calibrate([tmp_path / "one", tmp_path / "two"], tmp_path / "run", model, "none")
-    stand, swapped = retuned(stand_of(run, quiet), ["mount_slip@366"], quiet)
-    assert time_s[first - 1] < swapped["mount_slip@366"].shape < time_s[first]
-    sizes = {name: x for name, x in stand.estimate.values.items() if "mount_slip" in name}
-    assert len(sizes) == 2
-    for (_, x), size_m in zip(sorted(sizes.items()), (1e-3, -2e-3), strict=True):
-        assert x[3] == pytest.approx(size_m, abs=1e-4)
-
-
 @pytest.mark.parametrize(
     ("more", "dof", "sure"), [(6.0, 1, 0.01), (6.0, 6, None), (1.0, 1, "kept")]
 )
@@ -240,3 +202,27 @@ def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
     monkeypatch.setattr(steps, "_fitted", lambda *a, sure: asked.append((a[1], sure)) or [rival])
     found = steps._by_likelier(None, step, [], None)
     assert (found, asked) == (([], []) if sure == "kept" else ([rival], [(rival, sure)]))
+
+
+def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
+    """A mount is of one rig, so its slip is estimated for each; the time, for both together."""
+    rng, poses, first = np.random.default_rng(3), 60, 33
+    time_s = np.arange(poses) * 12.0
+    world = arm_worlds.bent(tmp_path / "one", "ur10", rng)
+    shutil.copytree(tmp_path / "one", tmp_path / "two")
+    for rig, size_m in (("one", 1e-3), ("two", -2e-3)):
+        folder = tmp_path / rig
+        read = world.draw(rng, poses)
+        slip = size_m * np.outer(np.arange(poses) >= first, np.eye(6)[3])
+        T = world.seen(read) * arm_worlds.exp(slip) * arm_worlds.exp(arm_worlds.noise(rng, poses))
+        arm_worlds.save(folder, world, read, T, {"time_s": time_s})
+        path = folder / "rig.yaml"
+        path.write_text(path.read_text("utf-8").replace("name: arm", f"name: {rig}"), "utf-8")
+    model = Model((*GEOMETRY, "mount_slip@366"))  # two stops early
+    run = calibrate([tmp_path / "one", tmp_path / "two"], tmp_path / "run", model, "none")
+    stand, swapped = retuned(stand_of(run, quiet), ["mount_slip@366"], quiet)
+    assert time_s[first - 1] < swapped["mount_slip@366"].shape < time_s[first]
+    sizes = {name: x for name, x in stand.estimate.values.items() if "mount_slip" in name}
+    assert len(sizes) == 2
+    for (_, x), size_m in zip(sorted(sizes.items()), (1e-3, -2e-3), strict=True):
+        assert x[3] == pytest.approx(size_m, abs=1e-4)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -26,11 +27,12 @@ from calib.effects import CATALOGUE, Scatter, Site
 from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
+from calib.residuals.groups import Group
 from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
-from calib.solve.components import Sums, sigma_beyond, spreads, squares
+from calib.solve.components import NO_CHECKS, Sums, sigma_beyond, spreads, squares
 from calib.solve.components.checks import Checks
-from calib.solve.components.told import LEAST_SD, Told, ToldApart, told
+from calib.solve.components.told import LEAST_SD, Told, told
 from calib.solve.estimate import Estimate
 
 ALPHA_SCATTER = LEVELS["scatter by chance"]
@@ -50,13 +52,13 @@ NOUNS = {
 
 @dataclass(frozen=True)
 class Spread:
-    """How widely values scatter, or the rows of one body beyond their sigma.
+    """How widely values scatter, or the rows of one body, joint or part beyond their sigma.
 
     Args:
-        of: the body, as files have it; empty where the effect has one spread.
+        of: whose it is, as files have it; empty where the effect has one spread.
         unit: "m" or "rad".
         sd, sigma: the spread, and its sigma.
-        who: the body, as people read it.
+        who: the same, as people read it.
     """
 
     of: str
@@ -290,25 +292,29 @@ def rows_by_chance(
         sums |= beside_bodies(whole, problem, whose, wild)
     tests = (_of_rows(effect, sums, problem) for effect in effects)
     found = [chance for chance in tests if chance is not None]
-    if sum(chance.found and chance.effect.site in TAKING_IN for chance in found) < 2:
+    return _by_likelihood(found, whole, problem, wild)
+
+
+def _by_likelihood(
+    found: list[Chance], whole: Linearisation, problem: Problem, wild: Sequence[Group]
+) -> list[Chance]:
+    """The same, where scatter of a tracker and of joints, if both are found, are in the order of
+    their likelihoods over all rows of each stop: rows of one kind show what those of the other err
+    by, and a fit that lacks either has given them less weight."""
+    both = [chance for chance in found if chance.found and chance.effect.site in TAKING_IN]
+    if len(both) < 2:
         return found
-    told = told_by_stop(whole, problem, {w: i for i, w in enumerate(_taking_in(problem))}, wild)
-    return [_by_likelihood(chance, told, problem) for chance in found]
-
-
-def _taking_in(problem: Problem) -> list[Whose]:
-    return [whose for site in TAKING_IN for whose in rows_at(problem, site)]
-
-
-def _by_likelihood(chance: Chance, told: ToldApart, problem: Problem) -> Chance:
-    """The same with its likelihood ratio over rows of bodies and joints, if it is of these: what
-    others would take in, and weights that a fit without it gave, make no difference."""
-    if chance.effect.site not in TAKING_IN:
-        return chance
-    mine, every = rows_at(problem, chance.effect.site), _taking_in(problem)
-    of_it = told.of(*(every.index(whose) for whose in mine))
-    ratio = of_it.statistic(of_it.spread(np.ones(len(mine))))
-    return replace(chance, statistic=ratio)
+    mine = [rows_at(problem, chance.effect.site) for chance in both]
+    number = {whose: i for i, whose in enumerate(chain(*mine))}
+    told = told_by_stop(whole, problem, number, wild)
+    ratio = []
+    for some in mine if told.parts else ():
+        of_it = told.of(*(number[whose] for whose in some))
+        ratio.append(of_it.statistic(of_it.spread(np.ones(len(some)))))
+    by_rows = [chance.statistic for chance in both]
+    ordered = dict(zip(np.argsort(ratio), sorted(by_rows), strict=False))
+    again = {id(c): replace(c, statistic=ordered.get(i, c.statistic)) for i, c in enumerate(both)}
+    return [again.get(id(chance), chance) for chance in found]
 
 
 def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
@@ -338,32 +344,31 @@ def _of_rows(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
 
 def _of_readings(effect: Scatter, sums: Sums, problem: Problem) -> Chance | None:
     """The same of joint readings: of all of them together, and of each joint's."""
-    known = sigmas(problem)
-    mine = [whose for whose in rows_at(problem, effect.site) if whose in sums]
-    if not any(whose.unit == effect.leading for whose in mine):
+    among = next((sums[w].among for w in rows_at(problem, effect.site) if w in sums), None)
+    leading = [w.unit == effect.leading for w in among.whose] if among else []
+    every, each = among.checks(among.first) if among else (NO_CHECKS, [])
+    if every.left < FEWEST_MEMBERS or not any(leading):
         return None
-    among = sums[mine[0]].among
-    sigma, beyond = np.array([known[whose] for whose in mine]).T
-    first = np.sqrt(sigma**2 - beyond**2)
-    every, each = among.checks(first / sigma)
-    if every.left < FEWEST_MEMBERS:
-        return None
-    of_joints = [(c, s) for c, s in zip(each, first, strict=True) if c.left >= FEWEST_MEMBERS]
-    looked = [(every, float(np.median(first))), *of_joints]
-    total = np.maximum(among.likeliest * sigma, first)
-    ratio = among.told.statistic(total / sigma) - among.told.statistic(first / sigma)
-    p = [special.chdtrc(checks.dof, checks.scaled) for checks, _ in looked]
-    sd, of_total = np.sqrt(total**2 - first**2), among.sigma * sigma
-    of_sd = map(sigma_beyond, sd.tolist(), (2.0 * total * of_total).tolist())
+    known = [checks.left >= FEWEST_MEMBERS for checks in each]
+    looked = [every, *(checks for checks, enough in zip(each, known, strict=True) if enough)]
+    p = [special.chdtrc(checks.dof, checks.scaled) for checks in looked]
+    sigma = np.array([sigmas(problem)[whose][0] for whose in among.whose])
+    first, best = among.first * sigma, among.likeliest
+    ratio = among.told.statistic(best) - among.told.statistic(among.first)
+    sd = np.sqrt(np.maximum((best * sigma) ** 2 - first**2, 0.0))
+    of_variance = 2.0 * best * among.told.sigma(best) * sigma**2
+    of_sd = map(sigma_beyond, sd.tolist(), of_variance.tolist())
+    mine = np.flatnonzero(np.array(leading) & known)
+    of_it = [(every, np.median(first[leading])), *((each[j], first[j]) for j in mine)]
     return Chance(
         effect,
         spreads=[
             Spread(of=whose.text, unit=whose.unit, sd=float(one), sigma=of, who=whose.what)
-            for whose, one, of in zip(mine, sd, of_sd, strict=True)
+            for whose, one, of in zip(among.whose, sd, of_sd, strict=True)
         ],
         statistic=float(ratio),
         p_value=float(after_looks(min(p), len(p))),
-        detectable=min(_detectable(checks, s**2, len(looked)) for checks, s in looked),
+        detectable=min(_detectable(checks, s**2, len(looked)) for checks, s in of_it),
     )
 
 

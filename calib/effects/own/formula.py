@@ -120,6 +120,10 @@ class FormulaEffect(Effect):
         return plain(self.file.model_dump(exclude_defaults=True))
 
     @property
+    def goes_with_time(self) -> bool:
+        return bool({"elapsed_s", "time_s"}.intersection(self.covariates))
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Their names, in the formulas' order."""
         count = len(self.file.basis)

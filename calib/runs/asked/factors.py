@@ -5,13 +5,14 @@ from __future__ import annotations
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
-from calib.recalibration.links import freedoms
 from calib.recalibration.prior import earlier
+from calib.results.outstanding import freedoms
 from calib.runs.reopen import problem_of, reopened, start_of, state_of
-from calib.runs.run import Run
+from calib.runs.run import Run, solution_digest
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, resume
 from calib.solve.graph import FactorGraph
+from chains.errors import InputError
 
 
 @one_blas_thread
@@ -41,7 +42,16 @@ def estimate_of(run: Run, progress: Progress = lambda what, done, total: None) -
 
 
 def prior_of(run: Run, problem: Problem) -> JointPrior | None:
-    """What stood for CAD in a run's fit, less sure of what had moved; None where CAD did."""
+    """What stood for CAD in a run's fit, less sure of what had moved; None where CAD did.
+
+    Raises:
+        InputError: the earlier run is gone, or has changed since.
+    """
     if run.prior is None:
         return None
-    return earlier(problem, Run.open(run.prior).solution).loosened(freedoms(run.summary))
+    before = Run.open(run.prior)
+    if run.model.get("prior_sha256") not in (None, solution_digest(before.folder)):
+        raise InputError(
+            f"{before.folder} has changed since {run.folder} was fitted from it; fit that again"
+        )
+    return earlier(problem, before.solution).loosened(freedoms(run.summary))

@@ -14,11 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.effects import Site
 from calib.linear.system import Linearisation, Values
 from calib.problem.places import joints_at
 from calib.problem.problem import Block, Problem, SurfaceCells
-from calib.problem.spread import Whose, by_chance, readings, rows_at, sigmas, widening
+from calib.problem.spread import Whose, by_chance, readings, sigmas, widening
 from calib.problem.without import ROD
 from calib.residuals.groups import Group
 from calib.residuals.seen import BodiesTogether, SeenBody
@@ -88,10 +87,10 @@ def squares_beside_bodies(
     if any(each.kind == "target" for each in whose):
         out |= _of_targets(linear, kept, graph_rows, wild)
     off = {joints_at(problem, group) for group in wild if group.kind == "joints"}
-    joints = [each for each in rows_at(problem, Site.JOINTS) if each in whose]
-    if joints and (good := [u for u in readings(problem) if u.name not in off]):
-        out |= Readings.of(joints, good, values, linear, kept).of_each
-    return out
+    joints = {w: s for w, s in sigmas(problem).items() if w.kind == "joints" and w in whose}
+    good = [u for u in readings(problem) if u.name not in off]
+    found = Readings.of(joints, good, values, linear, kept) if joints else None
+    return out | (found.of_each if found else {})
 
 
 def _of_targets(

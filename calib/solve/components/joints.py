@@ -7,7 +7,7 @@ of them. Stops tell hardly anything of each other's readings, so these come in p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,7 @@ import numpy as np
 from calib.linear.clusters import Entries, over_all
 from calib.linear.system import Linearisation, Values
 from calib.problem.spread import Whose
-from calib.problem.unknowns import Unknown
+from calib.problem.unknowns import Unknown, is_read
 from calib.solve.components.checks import Checks
 from calib.solve.components.told import Told, ToldApart
 
@@ -28,45 +28,49 @@ class Readings:
     """What all rows say of joint readings.
 
     Args:
-        whose: (J,) the joints.
+        whose: (J,) the joints, each of which is read somewhere.
         told: of their readings, in sigmas that these have in the fit; each joint is a group.
+        first: (J,) what their sigmas were at first, in the same: they scatter by no less.
     """
 
     whose: Sequence[Whose]
     told: ToldApart
+    first: np.ndarray
 
     @classmethod
     def of(
         cls,
-        whose: Sequence[Whose],
+        sigmas: Mapping[Whose, tuple[float, float]],
         some: Sequence[Unknown],
         values: Values,
         linear: Linearisation,
         kept: np.ndarray,
-    ) -> Readings:
-        """Of those at stops.
+    ) -> Readings | None:
+        """Of those at stops; None where no joint is read at any of them.
 
         Args:
-            whose: the joints.
+            sigmas: the joints, and of each its sigma, and how much of that it had not at first.
             some: what encoders misreport at each stop.
             values, linear, kept: as of `squares_beside_bodies`.
         """
-        group = {each.what: j for j, each in enumerate(whose)}
-        known = [np.flatnonzero(u.is_read & [dof in group for dof in u.dofs]) for u in some]
-        pairs = [(u, at) for u, at in zip(some, known, strict=True) if len(at)]
+        whose = [w for w in sigmas if any(u.reads(w.what, w.unit).any() for u in some)]
+        if not whose:
+            return None
+        group = {each: j for j, each in enumerate(whose)}
+        numbers = [_numbers(u, group) for u in some]
+        pairs = [
+            (u, number) for u, number in zip(some, numbers, strict=True) if (number >= 0).any()
+        ]
         count = max(1, READINGS_TOGETHER // len(whose))
         parts = [pairs[i : i + count] for i in range(0, len(pairs), count)]
-        return cls(whose, ToldApart([_part(p, group, values, linear, kept) for p in parts]))
+        sigma, beyond = np.array([sigmas[each] for each in whose]).T
+        told = ToldApart([_part(part, values, linear, kept) for part in parts])
+        return cls(whose, told, np.sqrt(sigma**2 - beyond**2) / sigma)
 
     @cached_property
     def likeliest(self) -> np.ndarray:
         """(J,) how widely each joint's readings scatter, in sigmas that they have in the fit."""
-        return self.told.spread(np.ones(len(self.whose)))
-
-    @cached_property
-    def sigma(self) -> np.ndarray:
-        """(J,) of that."""
-        return self.told.sigma(self.likeliest)
+        return self.told.spread(self.first, least=self.first)
 
     @property
     def of_each(self) -> dict[Whose, ReadingChecks]:
@@ -93,21 +97,28 @@ class Readings:
         return Checks.together(every), [Checks.together(found) for found in each]
 
 
+def _numbers(unknown: Unknown, group: Mapping[Whose, int]) -> np.ndarray:
+    """Which joint each reading (dim,) is of; -1 of those that are not asked for, or not read."""
+    each = zip(unknown.dofs, unknown.units, strict=True)
+    number = np.array([group.get(Whose("joints", *of), -1) for of in each], int)
+    return np.where(is_read(unknown.sigma), number, -1)
+
+
 def _part(
-    pairs: Sequence[tuple[Unknown, np.ndarray]],
-    group: dict[str, int],
+    numbered: Sequence[tuple[Unknown, np.ndarray]],
     values: Values,
     linear: Linearisation,
     kept: np.ndarray,
 ) -> Told:
-    """Of readings at some stops: what is misreported there, and which of it (n,) is asked for.
+    """Of readings at some stops: what is misreported there, and which joint (dim,) each is of.
     Those that the fit gave less weight count as all others: what all else says of them is the
     same."""
+    pairs = [(u, np.flatnonzero(number >= 0)) for u, number in numbered]
     sigma = np.concatenate([u.sigma[at] for u, at in pairs])
     scaled = np.concatenate([values[u.name][at] for u, at in pairs]) / sigma
     columns = np.concatenate([linear.layout.columns([u.name])[at] for u, at in pairs])
     rows = over_all([Entries.one_each(1.0 / sigma, columns)], linear.layout.size)
-    of_each = np.array([group[u.dofs[i]] for u, at in pairs for i in at])
+    of_each = np.concatenate([number[number >= 0] for _, number in numbered])
     variance = np.concatenate([np.full(len(at), 1.0 / u.weight) for u, at in pairs])
     return Told.fitted(scaled, linear.covariance(rows, kept), variance, of_each)
 
@@ -128,4 +139,6 @@ class ReadingChecks(Checks):
         return float(self.among.likeliest[self.number] ** 2 - 1.0)
 
     def sigma(self, d: float) -> float:
-        return float(2.0 * np.sqrt(1.0 + d) * self.among.sigma[self.number])
+        sd = self.among.likeliest.copy()
+        sd[self.number] = np.sqrt(1.0 + d)
+        return float(2.0 * sd[self.number] * self.among.told.sigma(sd)[self.number])

@@ -113,14 +113,14 @@ class ToldApart:
         """As of `Told`."""
         return ToldApart([part.of(*groups) for part in self.parts])
 
-    def spread(self, start: np.ndarray) -> np.ndarray:
-        """As of `Told`."""
+    def spread(self, start: np.ndarray, least: np.ndarray | None = None) -> np.ndarray:
+        """As of `Told`; the sds (G,) are no less than some, or than next to nothing."""
 
         def unlikely(log_variance: np.ndarray) -> tuple[float, np.ndarray]:
             values, slopes = zip(*(part.unlikely(log_variance) for part in self.parts), strict=True)
             return sum(values), np.sum(slopes, axis=0)
 
-        return _likeliest(unlikely, start)
+        return _likeliest(unlikely, start, least)
 
     def statistic(self, sd: np.ndarray) -> float:
         """As of `Told`."""
@@ -132,12 +132,14 @@ class ToldApart:
 
 
 def _likeliest(
-    unlikely: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray
+    unlikely: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    start: np.ndarray,
+    least: np.ndarray | None = None,
 ) -> np.ndarray:
-    """The sd (G,) of each group, from a start (G,)."""
+    """The sd (G,) of each group, from a start (G,); no less than `least` (G,)."""
     first = 2.0 * np.log(start)
-    ends = [first + 2.0 * np.log(times) for times in (LEAST_SD, LARGEST_SD)]
-    bounds = np.stack(ends, axis=1)
+    least = LEAST_SD * start if least is None else least
+    bounds = np.stack([2.0 * np.log(least), first + 2.0 * np.log(LARGEST_SD)], axis=1)
     best = minimize(unlikely, first, jac=True, method="L-BFGS-B", bounds=bounds, options=PRECISE)
     return np.exp(best.x / 2.0)
 
