@@ -384,7 +384,9 @@ def planner_without_places(
         aim = purpose_until(stand, until)
     else:
         aim = purpose_of(fitted, stand, purpose if fitted else purpose or ALL)
-    prior = prior_of(fitted, problem_of(fitted, stand.sources)) if fitted else None
+    prior = None
+    if fitted and fitted.prior:
+        prior = prior_of(fitted, problem_of(fitted, stand.sources))
     cameras = stand.sources[0].recording.folder / CAMERAS
     return Planner(
         cameras_m=read_cameras(cameras) if cameras.is_file() else None,

@@ -57,10 +57,8 @@ class Readings:
         if not whose:
             return None
         group = {each: j for j, each in enumerate(whose)}
-        numbers = [_numbers(u, group) for u in some]
-        pairs = [
-            (u, number) for u, number in zip(some, numbers, strict=True) if (number >= 0).any()
-        ]
+        numbered = [(u, _numbers(u, group)) for u in some]
+        pairs = [(u, number) for u, number in numbered if (number >= 0).any()]
         count = max(1, READINGS_TOGETHER // len(whose))
         parts = [pairs[i : i + count] for i in range(0, len(pairs), count)]
         sigma, beyond = np.array([sigmas[each] for each in whose]).T
