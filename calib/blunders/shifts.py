@@ -163,7 +163,7 @@ def told_by_stop(
                 left, score = at_their_sigmas(some, H[mine, mine], b[mine])
                 left = block_diag(*(rows.own_information for rows in some)) - left
                 found.append(Told(score[at], left[np.ix_(at, at)], group[at]))
-    return ToldApart(found)
+    return ToldApart.at_stops(found)
 
 
 def _whose(rows: GroupRows) -> list[Whose | None]:

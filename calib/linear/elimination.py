@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
@@ -98,14 +98,19 @@ def square_root(matrix: np.ndarray) -> np.ndarray:
     return root * scale
 
 
-def inverse_and_log_det(inner: np.ndarray) -> tuple[np.ndarray, float]:
-    """Of a symmetric matrix whose eigenvalues are all at least 1, though rounding errors of the
-    largest may exceed that: the inverse, and the logarithm of the determinant."""
+def inverse_and_log_det(inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of symmetric matrices (..., n, n) whose eigenvalues are all at least 1, though rounding
+    errors of the largest may exceed that: the inverses, and the logarithms (...) of their
+    determinants."""
     try:
-        factor = cho_factor(inner)
+        factor = np.linalg.cholesky(inner)
     except np.linalg.LinAlgError:
         values, axes = np.linalg.eigh(inner)
         values = np.maximum(values, 1.0)
-        return (axes / values) @ axes.T, float(np.log(values).sum())
-    log_det = 2.0 * float(np.log(np.diag(factor[0])).sum())
-    return cho_solve(factor, np.eye(len(inner))), log_det
+        return (axes / values[..., None, :]) @ np.swapaxes(axes, -1, -2), _logs(values)
+    half = np.linalg.inv(factor)
+    return np.swapaxes(half, -1, -2) @ half, 2.0 * _logs(np.diagonal(factor, axis1=-2, axis2=-1))
+
+
+def _logs(values: np.ndarray) -> np.ndarray:
+    return np.log(values).sum(axis=-1)

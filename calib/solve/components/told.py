@@ -20,11 +20,12 @@ DIRECTION_SEEN = 1e-9  # of the largest information, below which a direction of 
 
 @dataclass(frozen=True)
 class Told:
-    """What all rows but their priors say of values by chance (Q,).
+    """What all rows but their priors say of values by chance (Q,), or of such values at each of
+    some stops that tell nothing of each other.
 
     Args:
-        score: (Q,) at zero, all else being estimated there.
-        information: (Q, Q), all else being estimated.
+        score: (..., Q) at zero, all else being estimated there.
+        information: (..., Q, Q), all else being estimated.
         group: (Q,) which group each belongs to, from 0.
     """
 
@@ -58,32 +59,31 @@ class Told:
         (MacKay 1992)."""
         variance = np.exp(log_variance)
         values, covariance, log_det = self.given(variance)
-        count, known, square = (
-            np.bincount(self.group, each, minlength=len(variance))
-            for each in (None, np.diag(covariance), np.square(values))
-        )
-        slope = count - (known + square) / variance
-        return log_det - float(self.score @ values), slope
+        known = np.diagonal(covariance, axis1=-2, axis2=-1)
+        seen = 1.0 - (known + np.square(values)) / variance[self.group]
+        slope = np.bincount(self.group, _summed(seen), minlength=len(variance))
+        return log_det - float(np.vdot(self.score, values)), slope
 
     def of(self, *groups: int) -> Told:
         """Of one group, or of some, all others being 0; numbered from 0 as they are given."""
         at = np.flatnonzero(np.isin(self.group, groups))
         number = np.array([groups.index(group) for group in self.group[at].tolist()], int)
-        return Told(self.score[at], self.information[np.ix_(at, at)], number)
+        return Told(self.score[..., at], self.information[..., at[:, None], at], number)
 
     def statistic(self, sd: np.ndarray) -> float:
         """Twice the log of the likelihood ratio of the sds (G,) against none."""
         values, _, log_det = self.given(np.square(sd))
-        return float(self.score @ values) - log_det
+        return float(np.vdot(self.score, values)) - log_det
 
     def given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """The values (Q,) and their covariance, given the variances of the groups; and by how much
-        the log of the determinant of what is told of them grows."""
+        """The values (..., Q) and their covariance, given the variances of the groups; and by how
+        much the log of the determinant of what is told of them grows, of all stops together."""
         root = np.sqrt(variance)[self.group]
         inner = np.eye(len(root)) + root[:, None] * self.information * root
         of_inner, log_det = inverse_and_log_det(inner)
         covariance = root[:, None] * of_inner * root
-        return covariance @ self.score, covariance, log_det
+        values = (covariance @ self.score[..., None])[..., 0]
+        return values, covariance, float(np.sum(log_det))
 
     def sigma(self, sd: np.ndarray) -> np.ndarray:
         """Of the sds (G,), from the expected information of the variances: ``tr(P E_i P E_j) / 2``
@@ -95,7 +95,7 @@ class Told:
         _, covariance, _ = self.given(np.square(sd))
         P = self.information - self.information @ covariance @ self.information
         sums = np.zeros((len(sd), len(sd)))
-        np.add.at(sums, (self.group[:, None], self.group), np.square(P) / 2)
+        np.add.at(sums, (self.group[:, None], self.group), _summed(np.square(P), axes=2) / 2)
         return sums
 
 
@@ -108,6 +108,22 @@ class ToldApart:
     """
 
     parts: Sequence[Told]
+
+    @classmethod
+    def at_stops(cls, some: Sequence[Told]) -> ToldApart:
+        """Of values (Q,) at each of some stops: those of the same groups are one part."""
+        alike: dict[bytes, list[Told]] = {}
+        for each in some:
+            alike.setdefault(each.group.tobytes(), []).append(each)
+        parts = (
+            Told(
+                np.stack([one.score for one in each]),
+                np.stack([one.information for one in each]),
+                each[0].group,
+            )
+            for each in alike.values()
+        )
+        return cls(list(parts))
 
     def of(self, *groups: int) -> ToldApart:
         """As of `Told`."""
@@ -129,6 +145,11 @@ class ToldApart:
     def sigma(self, sd: np.ndarray) -> np.ndarray:
         """As of `Told`."""
         return _sigma(sd, np.sum([part.of_variances(sd) for part in self.parts], axis=0))
+
+
+def _summed(values: np.ndarray, axes: int = 1) -> np.ndarray:
+    """Over all stops: over all but the last axes."""
+    return values.reshape(-1, *values.shape[values.ndim - axes :]).sum(axis=0)
 
 
 def _likeliest(
