@@ -148,6 +148,11 @@ class Effect(ABC):
         return self.site is Site.REFERENCE and self.covariates == ("point_m",)
 
     @property
+    def of_volume(self) -> bool:
+        """Whether it is the tracker's error at a place, which markers of targets have as well."""
+        return self.site is Site.TRACKER and self.covariates == ("tracked",)
+
+    @property
     def goes_with_time(self) -> bool:
         """Whether it is of the day, as a drift, and not of the rig. The order of readings in time,
         which a gear's play depends on, is no drift."""

@@ -153,6 +153,9 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
             [t for t in part.terms if t.effect.of_scanner],
         )
     )
+    markers = np.stack([lower_m, upper_m], axis=1)
+    view = View(part.source.rig, shape[0], {"tracked": se3.from_xyz_rpy(markers, np.zeros(3))}, np.zeros((1, 0)))
+    tracked = {t.variable: t.basis(view)[:, :, 3:] for t in part.terms if t.effect.of_volume}
     for m, name in enumerate(targets.names):
         marker = vector_unknown(
             f"{part.prefix}target:{name}",
@@ -178,6 +181,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
                 sigma_marker_m=spec.sigma_marker_m,
                 shift={v: b[m] for v, b in shifts.items()},
                 scanned={v: b[m] for v, b in scanned.items()},
+                tracked={v: b[m] for v, b in tracked.items()},
                 groups=tuple(Group("target", name, what, part.label) for what in TARGET_PARTS),
                 weight=None if whole[m].all() else whole[m].astype(float),
             )

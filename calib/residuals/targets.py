@@ -20,8 +20,8 @@ class HangingTarget:
     """One rod. Its lower marker's true place p is unknown; gravity g is common to all rods.
 
     ``lower - p``, ``upper - p`` across the rod, and ``faro + s - T_faro_world (p + L g)``, s the
-    scanner's error there, each over its sigma; the spacing of the markers is not used, so it need
-    not be known.
+    scanner's error there, each over its sigma; markers less what the tracker's volume adds to them.
+    The spacing of the markers is not used, so it need not be known.
 
     Args:
         name: for messages.
@@ -33,6 +33,8 @@ class HangingTarget:
         sigma_sphere_m, sigma_marker_m: per axis.
         shift: (3, P) per variable: where the sphere truly sits beyond that, world frame.
         scanned: (3, P) per variable: where it truly sits beyond where it was scanned, faro frame.
+        tracked: (2, 3, P) per variable: where the lower and the upper marker are seen beyond where
+            they truly are, world frame.
         groups: (3,) the names of the rows of each of `TARGET_PARTS`.
         weight: (3,) of the rows of each, robust, and 0 for a part that was left out; 1 where None.
         scatter: "sphere" or "marker" -> how widely it scatters beyond what its sigma was at first.
@@ -50,6 +52,7 @@ class HangingTarget:
     sigma_marker_m: float
     shift: Mapping[str, np.ndarray]
     scanned: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tracked: Mapping[str, np.ndarray] = field(default_factory=dict)
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
     scatter: Mapping[str, float] = field(
@@ -61,7 +64,8 @@ class HangingTarget:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        return (self.marker, self.gravity, self.reference, *self.shift, *self.scanned)
+        of_effects = (*self.shift, *self.scanned, *self.tracked)
+        return (self.marker, self.gravity, self.reference, *of_effects)
 
     def scattering(self, of: str, sd: float) -> HangingTarget:
         """The target with another spread beyond the sigma of its sphere, or of its markers."""
@@ -74,7 +78,8 @@ class HangingTarget:
         """Nine whitened rows [lower marker, upper marker across the rod, sphere]."""
         p, T = values[self.marker], values[self.reference]
         g, by_gravity = down(values[self.gravity])
-        rod = self.upper_m - p
+        added = sum((b @ values[n] for n, b in self.tracked.items()), np.zeros((2, 3)))
+        lower, rod = self.lower_m - added[0], self.upper_m - added[1] - p
         across = rod - g * (g @ rod)
         sphere = p + self.below_m * g + sum(b @ values[n] for n, b in self.shift.items())
         R_t = T[:3, :3].T
@@ -82,7 +87,7 @@ class HangingTarget:
         scanned = self.faro_m + sum(b @ values[n] for n, b in self.scanned.items())
         residual = np.concatenate(
             [
-                (self.lower_m - p) / self.sigma_marker_m,
+                (lower - p) / self.sigma_marker_m,
                 across / self.sigma_marker_m,
                 (scanned - in_faro) / self.sigma_sphere_m,
             ]
@@ -113,4 +118,7 @@ class HangingTarget:
             d[name] = np.vstack([np.zeros((6, basis.shape[1])), -R_t @ basis * sphere])
         for name, basis in self.scanned.items():
             d[name] = np.vstack([np.zeros((6, basis.shape[1])), basis * sphere])
+        for name, (lower, upper) in self.tracked.items():
+            of_markers = np.vstack([-lower, (along - eye) @ upper]) * marker
+            d[name] = np.vstack([of_markers, np.zeros((3, lower.shape[1]))])
         return d

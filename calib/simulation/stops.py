@@ -274,7 +274,7 @@ def hang_targets(
     """Targets (M,) as measured: `faro`, `upper` and `lower` (M, 3) m, spread through the room.
 
     The sphere hangs ``sphere_below_lower_marker_m`` below the lower marker along gravity, which is
-    the FARO's -z; effects displace it from there.
+    the FARO's -z; effects displace it from there. A bent volume of the tracker displaces markers.
     """
     spec, count = truth.rig.target, len(names)
     sets = FLOOR_CENTRE_M + rng.uniform((-2.8, -1.9, 0.5), (2.8, 1.9, 1.9), (200, count, 3))
@@ -287,9 +287,13 @@ def hang_targets(
     lower = nominal + spec.sphere_below_lower_marker_m * up
     scanner = replace(truth, effects=tuple(e for e in truth.effects if e[0].of_scanner))
     scanned = sphere - scanner.error(Site.REFERENCE, view, (3,))
+    markers = np.stack([lower, lower + 0.12 * up], axis=1)
+    volume = replace(truth, effects=tuple(e for e in truth.effects if e[0].of_volume))
+    view = View(truth.rig, count, {"tracked": se3.from_xyz_rpy(markers, np.zeros(3))}, np.zeros((1, 0)))
+    lower, upper = np.moveaxis(markers + volume.error(Site.TRACKER, view, (2, 6))[..., 3:], 1, 0)
     measured = (
         ("faro", scanned, spec.sigma_sphere_m),
-        ("upper", lower + 0.12 * up, spec.sigma_marker_m),
+        ("upper", upper, spec.sigma_marker_m),
         ("lower", lower, spec.sigma_marker_m),
     )
     return {
