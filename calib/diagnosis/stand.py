@@ -27,7 +27,6 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
-from calib.residuals.seen import BodiesTogether
 from calib.results.intervals import Intervals, intervals
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
@@ -94,7 +93,7 @@ class Stand:
         meetings = dict(self.problem.meetings)
         if of is not self or any(group.kind == "surface" for group in groups):  # other surfaces
             meetings = {i: m for i, m in meetings.items() if sources[i].reference is None}
-        problem = problems.build(self._as_fitted(sources), model, meetings=meetings)
+        problem = problems.build(sources, model, meetings=meetings)
         estimate = solve(problem, progress=progress, start=self.estimate.start)
         return Stand(sources, model, problem, estimate, own=self.own)
 
@@ -106,26 +105,7 @@ class Stand:
 
     def problem_of(self, model: Model) -> Problem:
         """The problem of another model on these recordings; beams meet what they met here."""
-        return problems.build(self._seen, model, meetings=self.problem.meetings)
-
-    @cached_property
-    def _seen(self) -> Sequence[Source]:
-        return self._as_fitted(self.sources)
-
-    def _as_fitted(self, sources: Sequence[Source]) -> Sequence[Source]:
-        """The recordings, or these with some rows left out, where effects see bodies where the
-        model has them. What is measured errs, and an effect of it could explain its errors by
-        themselves."""
-        measured = {s.recording.folder: s for s in sources if s.rig.tracker}
-        poses = {folder: s.columns["tracked"].copy() for folder, s in measured.items()}
-        for together in BodiesTogether.of(self.estimate.problem.bodies):
-            fitted = together.in_world(self.estimate.values)
-            for block, T_world_body in zip(together.blocks, fitted, strict=True):
-                folder = block.stop_names[0][0]
-                body = list(measured[folder].rig.tracker.bodies).index(block.body)
-                poses[folder][[k for _, k in block.stop_names], body] = T_world_body
-        at = [(s, poses.get(s.recording.folder)) for s in sources]
-        return [s if T is None else s.seen_at(T) for s, T in at]
+        return problems.build(self.sources, model, meetings=self.problem.meetings)
 
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from calib.rig import Rig
+from chains import se3
 from chains.errors import InputError
 
 SHAPE_STEP = 0.01  # relative, to either side, for the derivative by a shape
@@ -80,6 +81,13 @@ class View:
             raise InputError(f"column '{name}' is not in this recording, which has {known}.")
         column = self.columns[name]
         return column() if callable(column) else column
+
+    @classmethod
+    def of_places(cls, rig: Rig, places_m: np.ndarray) -> View:
+        """What the effects of a tracker's volume look at: M places (K, M, 3) in its frame, as if a
+        body were there whose axes are those of the frame."""
+        T = se3.from_xyz_rpy(places_m, np.zeros(3))
+        return cls(rig, len(T), {"tracked": T}, np.zeros((len(T), 0)))
 
 
 @dataclass(frozen=True)

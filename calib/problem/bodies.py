@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import chain
+
 import numpy as np
 
 from calib.effects import Site, View
+from calib.forward import Term
 from calib.problem import start
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.unknowns import Owner, Role, vector_unknown
 from calib.residuals.groups import Group, level_of
 from calib.residuals.levels import Level
+from calib.residuals.seen import ByPlace
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.residuals.tracker import TrackedBody
 from chains import se3
@@ -22,7 +28,7 @@ NO_LEVEL_READ = np.array([0.0, 0.0, -1.0])  # until one is, down is where most w
 def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
     """Add a block for every tracked body and group of stops that share all unknowns."""
     tracker, recording = part.source.rig.tracker, part.source.recording
-    bases = _tracker_bases(part)
+    here = _tracker_bases(part)
     for b, body in enumerate(tracker.bodies if tracker else ()):
         poses = start.body_poses(part.source, body)
         point = start.is_point(part.source, body)
@@ -39,7 +45,8 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
                     sigma_m=tracker.sigma_m,
                     sigma_rad=tracker.sigma_rad,
                     is_point=point,
-                    bases={v: _rows(basis, seen)[:, b] for v, basis in bases.items()},
+                    bases={v: _rows(basis, seen)[:, b] for v, basis in here.bases.items()},
+                    by_place=here.by_place(seen, b),
                     stop_names=[(recording.folder, int(k)) for k in seen],
                     groups=tuple(Group("body", recording.stops[k], body, part.label) for k in seen),
                 )
@@ -122,12 +129,41 @@ def _add_gravity(problem: Problem, down: np.ndarray) -> None:
     )
 
 
-def _tracker_bases(part: SourceStops) -> dict[str, np.ndarray]:
-    """What the tracker adds to every body at every stop, (K or 1, B, 6, P) by unknown."""
+@dataclass(frozen=True)
+class _Added:
+    """What a tracker adds to bodies at all stops.
+
+    Args:
+        bases: unknown -> (K or 1, B, 6, P).
+        of_place: unknown -> the effect, of those that go by where the model has a body.
+        view: all that effects look at, of which these look at `columns`.
+    """
+
+    bases: Mapping[str, np.ndarray]
+    of_place: Mapping[str, Term]
+    view: View
+    columns: Collection[str]
+
+    def by_place(self, index: np.ndarray, number: int) -> ByPlace | None:
+        """What goes by the place of a body at some stops."""
+        if not self.of_place:
+            return None
+        columns = {name: self.view[name][index] for name in self.columns}
+        view = View(self.view.rig, len(index), columns, self.view.joints[index])
+        return ByPlace(self.of_place, view, number)
+
+
+def _tracker_bases(part: SourceStops) -> _Added:
     source = part.source
     view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
-    terms = (t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens)
-    return {t.variable: t.basis(view) for t in terms}
+    terms = [t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens]
+    of_place = [t for t in terms if "tracked" in t.effect.covariates]
+    return _Added(
+        bases={t.variable: t.basis(view) for t in terms if "tracked" not in t.effect.covariates},
+        of_place={t.variable: t for t in of_place},
+        view=view,
+        columns={*chain(*(t.effect.covariates for t in of_place))} & {*source.columns},
+    )
 
 
 def _rows(basis: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -153,8 +189,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
             [t for t in part.terms if t.effect.of_scanner],
         )
     )
-    markers = np.stack([lower_m, upper_m], axis=1)
-    view = View(part.source.rig, shape[0], {"tracked": se3.from_xyz_rpy(markers, np.zeros(3))}, np.zeros((1, 0)))
+    view = View.of_places(part.source.rig, np.stack([lower_m, upper_m], axis=1))
     tracked = {t.variable: t.basis(view)[:, :, 3:] for t in part.terms if t.effect.of_volume}
     for m, name in enumerate(targets.names):
         marker = vector_unknown(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -341,13 +340,6 @@ class Source:
         if self.rig.levels:
             columns["up"] = up_in_root(self.rig, recording)
         return {**columns, **recording.covariates}
-
-    def seen_at(self, T_world_body: np.ndarray) -> Source:
-        """The same where effects see bodies at these poses (K, B, 4, 4); what scans were read stay
-        read."""
-        seen = copy(self)
-        seen.__dict__["columns"] = {**self.columns, "tracked": T_world_body}
-        return seen
 
 
 def recording_names(sources: Sequence[Source]) -> list[str]:

@@ -10,9 +10,12 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from calib.forward import Derivatives, Placed, Stops, Values
+from calib.effects import View
+from calib.forward import Derivatives, Placed, Stops, Term, Values
 from calib.residuals.groups import Group
 from chains import se3
+
+STEP = 1e-4  # m and rad, for the derivative of a basis; of a quadratic one it is exact
 
 
 class Compared(NamedTuple):
@@ -29,6 +32,51 @@ class Compared(NamedTuple):
     direct: Derivatives
 
 
+@dataclass(frozen=True)
+class ByPlace:
+    """What an instrument adds to a body's pose by where that is, at K stops.
+
+    The place is that of the model. What is measured errs, and an effect of it could explain its own
+    errors: a tracker that scatters would have a scale.
+
+    Args:
+        terms: variable -> the effect as it stands in the model.
+        view: what effects look at; the bodies as measured in its column ``tracked`` (K, B, 4, 4).
+        number: of the body, among these.
+    """
+
+    terms: Mapping[str, Term]
+    view: View
+    number: int
+
+    def bases(self, T_world_body: np.ndarray) -> dict[str, np.ndarray]:
+        """Variable -> (K or 1, 6, P), of a body that is there (K, 4, 4), per unit."""
+        tracked = self.view["tracked"].copy()
+        tracked[:, self.number] = T_world_body
+        view = replace(self.view, columns={**self.view.columns, "tracked": tracked})
+        return {v: term.basis(view)[:, self.number] for v, term in self.terms.items()}
+
+    def turned(self, T_world_body: np.ndarray, values: Values) -> np.ndarray:
+        """Derivative (K, 6, 6) of what is added by the body's right increment."""
+        out = np.zeros((len(T_world_body), 6, 6))
+        if not any(np.any(values[v]) for v in self.terms):
+            return out
+        for i, step in enumerate(STEP * np.eye(6)):
+            ends = (self.bases(T_world_body @ se3.exp(by)) for by in (step, -step))
+            after, before = (sum(b @ values[v] for v, b in end.items()) for end in ends)
+            out[:, :, i] = (after - before) / (2 * STEP)
+        return out
+
+    @classmethod
+    def together(cls, some: Sequence[ByPlace]) -> ByPlace:
+        """Of stops that share every variable, taken together."""
+        first, views = some[0], [each.view for each in some]
+        columns = {n: np.concatenate([v[n] for v in views]) for n in first.view.columns}
+        joints = np.concatenate([v.joints for v in views])
+        view = View(first.view.rig, sum(v.rows for v in views), columns, joints)
+        return cls(first.terms, view, first.number)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SeenBody(ABC):
     """One body at K stops that share every variable, as an instrument has it.
@@ -41,6 +89,7 @@ class SeenBody(ABC):
         body: the body's frame.
         measured: (K, ...) what the instrument says.
         bases: variable -> (K or 1, 6, P), what the instrument adds to the body's pose, per unit.
+        by_place: what it adds by where the body is; None for nothing.
         stop_names: (K,) recording and number of each stop: rows of one err together.
         groups: (K,) the names of those rows.
         weight: (K,) robust weight of each stop's rows, 0 where set aside; 1 where None.
@@ -51,6 +100,7 @@ class SeenBody(ABC):
     body: str
     measured: np.ndarray
     bases: Mapping[str, np.ndarray] = field(default_factory=dict)
+    by_place: ByPlace | None = None
     stop_names: Sequence[tuple[Path, int]] = ()
     groups: tuple[Group, ...] = ()
     weight: np.ndarray | None = None
@@ -91,7 +141,7 @@ class SeenBody(ABC):
 
     @property
     def variables(self) -> tuple[str, ...]:
-        return (*self.stops.variables, *self.bases)
+        return (*self.stops.variables, *self.bases, *(self.by_place.terms if self.by_place else ()))
 
     @property
     def rows(self) -> int:
@@ -114,14 +164,18 @@ class SeenBody(ABC):
     def seen(self, values: Values, derivatives: bool = False) -> Placed:
         """T_world_body as the instrument should see it, all that it adds included."""
         placed = self.stops.in_world(self.body, values, derivatives)
-        if not self.bases:
+        of_place = self.by_place.bases(placed.T) if self.by_place else {}
+        bases = {**self.bases, **of_place}
+        if not bases:
             return placed
-        added = sum(basis @ values[name] for name, basis in self.bases.items())
+        added = sum(basis @ values[name] for name, basis in bases.items())
         d = placed.d
         if derivatives:
-            back = se3.adjoint(se3.inverse(se3.exp(added)))
+            back, by = se3.adjoint(se3.inverse(se3.exp(added))), se3.right_jacobian(added)
+            if self.by_place:
+                back = back + by @ self.by_place.turned(placed.T, values)
             d = {name: back @ each for name, each in d.items()}
-            d |= {n: se3.right_jacobian(added) @ b for n, b in self.bases.items()}
+            d |= {name: by @ basis for name, basis in bases.items()}
         return Placed(placed.T @ se3.exp(added), d)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
@@ -228,5 +282,6 @@ def _whole(blocks: Sequence[SeenBody]) -> SeenBody:
         stops=Stops.together([b.stops for b in blocks]),
         measured=np.concatenate([b.measured for b in blocks]),
         bases=bases,
+        by_place=first.by_place and ByPlace.together([b.by_place for b in blocks]),
         weight=None if all(b.weight is None for b in blocks) else np.concatenate(weights),
     )

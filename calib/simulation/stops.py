@@ -289,8 +289,8 @@ def hang_targets(
     scanned = sphere - scanner.error(Site.REFERENCE, view, (3,))
     markers = np.stack([lower, lower + 0.12 * up], axis=1)
     volume = replace(truth, effects=tuple(e for e in truth.effects if e[0].of_volume))
-    view = View(truth.rig, count, {"tracked": se3.from_xyz_rpy(markers, np.zeros(3))}, np.zeros((1, 0)))
-    lower, upper = np.moveaxis(markers + volume.error(Site.TRACKER, view, (2, 6))[..., 3:], 1, 0)
+    added = volume.error(Site.TRACKER, View.of_places(truth.rig, markers), (2, 6))[..., 3:]
+    lower, upper = np.moveaxis(markers + added, 1, 0)
     measured = (
         ("faro", scanned, spec.sigma_sphere_m),
         ("upper", upper, spec.sigma_marker_m),

@@ -305,9 +305,8 @@ def _believed(
     for block in problem.blocks:
         if isinstance(block, TrackedBody) and effect.site is Site.TRACKER:
             if block.body == source.rig.tracker.bodies[0]:
-                root, wrong = block.stops.root, block.bases[effect.name][0] @ theta
                 T = block.stops.in_root(block.body, values).T[0]
-                out[root] = values[root] @ T @ se3.exp(wrong) @ se3.inverse(T)
+                out[block.stops.root] = block.seen(values).T[0] @ se3.inverse(T)
         elif isinstance(block, HangingTarget) and effect.site is Site.TARGET:
             mesh = out[block.reference] = values[block.reference].copy()
             mesh[:3, 3] -= block.shift[effect.name] @ theta

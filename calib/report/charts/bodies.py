@@ -17,7 +17,6 @@ from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 from calib.results.outstanding import STANDS_OUT
 from calib.show.scale import round_up
-from chains import se3
 
 if TYPE_CHECKING:
     from calib.report.plots import Figure
@@ -144,8 +143,7 @@ def targets(evidence: Evidence) -> Iterator[Chart | Absent]:
 def _seen(blocks: Sequence[TrackedBody], values: Mapping[str, np.ndarray]) -> Arrows:
     at, off = [], []
     for block in blocks:
-        added = sum((B @ values[n] for n, B in block.bases.items()), np.zeros((1, 6)))
-        predicted = block.stops.in_world(block.body, values).T @ se3.exp(added)
+        predicted = block.seen(values).T
         at.append(block.measured[:, :3, 3])
         off.append(block.measured[:, :3, 3] - predicted[:, :3, 3])
     return Arrows(np.concatenate(at), np.concatenate(off))

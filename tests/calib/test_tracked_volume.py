@@ -1,0 +1,105 @@
+"""What a tracker errs by at a place: it moves all that is there, and the place is the model's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from calib.effects import find
+from calib.problem import build
+from calib.problem.model import Model, Source
+from calib.residuals.targets import HangingTarget
+from calib.runs.add import add
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
+from calib.simulation import simulate
+from calib.simulation.spec import load_spec
+
+from . import arm_worlds, rigs
+
+OF_PLACE = ("optitrack_scale", "optitrack_distortion", "tracker_creep")
+SCALE = 8e-4
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory):
+    folder = rigs.write(tmp_path_factory.mktemp("volume") / "box")
+    return build([Source.open(folder)], Model(tuple(map(find, OF_PLACE))))
+
+
+@pytest.fixture(scope="module")
+def values(problem):
+    """A state away from the drawing, where the tracker errs by centimetres."""
+    rng = np.random.default_rng(5)
+    errors = {n: rng.uniform(-0.03, 0.03, problem.variables[n].dim) for n in OF_PLACE}
+    return rigs.shaken(problem.variables, problem.initial, 0.1) | errors
+
+
+def test_derivatives_know_that_the_error_goes_with_the_place(problem, values):
+    assert {n for b in problem.bodies for n in b.by_place.terms} == set(OF_PLACE)
+    for body in problem.bodies[:4]:
+        rigs.assert_block_derivatives(body, problem.variables, values)
+
+
+def test_derivatives_of_targets_by_errors_of_the_tracker(problem, values):
+    targets = [b for b in problem.blocks if isinstance(b, HangingTarget)]
+    assert set(targets[0].tracked) == set(OF_PLACE[:2])
+    for target in targets:
+        rigs.assert_block_derivatives(target, problem.variables, values)
+
+
+def test_bodies_and_targets_are_seen_by_the_same_metre(problem, values):
+    """In a tracker's frame whose metre is too long all positions are longer, and nothing else."""
+    values = values | {n: np.zeros_like(values[n]) for n in OF_PLACE}
+    longer = values | {"optitrack_scale": np.array([SCALE])}
+    for body in problem.bodies:
+        true, seen = (body.seen(v).T for v in (values, longer))
+        np.testing.assert_allclose(seen[:, :3, 3], (1 + SCALE) * true[:, :3, 3], rtol=1e-12)
+        np.testing.assert_allclose(seen[:, :3, :3], true[:, :3, :3], atol=1e-12)
+    for target in (b for b in problem.blocks if isinstance(b, HangingTarget)):
+        (before, _), scaled = target.evaluate(values, False), 1 + SCALE
+        seen = replace(target, lower_m=scaled * target.lower_m, upper_m=scaled * target.upper_m)
+        tracked = {**target.tracked, "optitrack_scale": target.tracked["optitrack_scale"] * scaled}
+        after, _ = replace(seen, tracked=tracked).evaluate(
+            values | {"optitrack_scale": np.array([SCALE / scaled])}, False
+        )
+        np.testing.assert_allclose(after, before, atol=1e-9)
+
+
+def test_a_scale_that_all_the_tracker_sees_has_is_named_and_nothing_beside_it(tmp_path):
+    """It was told as scatter of targets too, of 1.8 mm in such a recording."""
+    simulate(load_spec("tiny"), tmp_path / "rec", 4, {})
+    for name, parts in (("stops", ("base_markers", "mount_markers")), ("targets", ("u", "l"))):
+        path = tmp_path / "rec" / f"{name}.csv"
+        table = pd.read_csv(path)
+        longer = [
+            c
+            for c in table.columns
+            if c.startswith(parts) and c.endswith(("_x", "_y", "_z", ".x", ".y", ".z"))
+        ]
+        assert len(longer) == 6
+        table[longer] *= 1 + SCALE
+        table.to_csv(path, index=False)
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run")).document()
+    named = [c for c in found["candidates"] if c["step"]]
+    assert [c["add"] for c in named] == ["optitrack_scale"]
+    (scale,), (sigma,) = named[0]["parameters"]["estimate"], named[0]["parameters"]["sigma"]
+    assert abs(scale - SCALE) < 4 * sigma
+
+
+@pytest.mark.parametrize("arm", ["puma560", "panda"])
+def test_noise_of_a_tracker_is_no_scale_of_it(tmp_path, arm):
+    """Of an arm whose geometry is unknown a scale is free. Added to the model it was 0.016 and
+    0.018, two of its sigmas, as it shrank the noise."""
+    rng, folder, poses = np.random.default_rng([78, 0]), tmp_path / "rec", 60
+    world = arm_worlds.bent(folder, arm, rng)
+    read = world.draw(rng, poses)
+    seen = world.seen(read) * arm_worlds.exp(7.0 * arm_worlds.noise(rng, poses))
+    arm_worlds.save(folder, world, read, seen, {}, 2e-5)
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    added = add(run, ["optitrack_scale"], tmp_path / "added")
+    found = yaml.safe_load((added.folder / "solution.yaml").read_text(encoding="utf-8"))
+    scale = found["effects"]["optitrack_scale"]
+    assert abs(scale["estimate"][0]) < scale["sigma"][0] / 2
