@@ -16,12 +16,13 @@ VOLUME_M = 3.0  # half the width of a usual volume
 
 
 class OptitrackScale(Effect):
-    """The tracker's metre is too long or too short: ``measured = true * (1 + s)``."""
+    """The tracker's metre is too long or too short: ``measured = true * (1 + s)``. Markers of
+    targets are measured by it as well."""
 
     name = "optitrack_scale"
     site = Site.TRACKER
     unit = "1"
-    formula = "position of a body = true + s * true, tracker frame"
+    formula = "position of a body or marker = true + s * true, tracker frame"
     typical = "100 to 1000 ppm, size assumed"
     covariates = ("tracked",)
     confounded_with = ("optitrack_distortion", "faro_scale", "range_scale")
@@ -35,12 +36,15 @@ class OptitrackScale(Effect):
 
 
 class OptitrackDistortion(Effect):
-    """The tracked volume is bent: a quadratic field of the position, about the tracker's origin."""
+    """The tracked volume is bent: a quadratic field of the position, about the tracker's origin.
+    It moves bodies and the markers of targets alike."""
 
     name = "optitrack_distortion"
     site = Site.TRACKER
     unit = "m"
-    formula = "position p of a body = true + sum of c_ijk p_j p_k / (3 m)^2, tracker frame"
+    formula = (
+        "position p of a body or marker = true + sum of c_ijk p_j p_k / (3 m)^2, tracker frame"
+    )
     typical = "0.2 to 2 mm at 3 m, size assumed"
     covariates = ("tracked",)
     confounded_with = ("optitrack_scale", "mount_slip")

@@ -91,9 +91,9 @@ def test_a_scale_that_all_the_tracker_sees_has_is_named_and_nothing_beside_it(tm
 
 @pytest.mark.parametrize("arm", ["puma560", "panda"])
 def test_noise_of_a_tracker_is_no_scale_of_it(tmp_path, arm):
-    """Of an arm whose geometry is unknown a scale is free. Added to the model it was 0.016 and
-    0.018, two of its sigmas, as it shrank the noise."""
-    rng, folder, poses = np.random.default_rng([78, 0]), tmp_path / "rec", 60
+    """Where the geometry of an arm is unknown, next to nothing tells a scale from that. Added to
+    the model, that of the first arm was 0.022 ± 0.009, as it shrank the noise."""
+    rng, folder, poses = np.random.default_rng([78, 1]), tmp_path / "rec", 60
     world = arm_worlds.bent(folder, arm, rng)
     read = world.draw(rng, poses)
     seen = world.seen(read) * arm_worlds.exp(7.0 * arm_worlds.noise(rng, poses))
@@ -102,4 +102,4 @@ def test_noise_of_a_tracker_is_no_scale_of_it(tmp_path, arm):
     added = add(run, ["optitrack_scale"], tmp_path / "added")
     found = yaml.safe_load((added.folder / "solution.yaml").read_text(encoding="utf-8"))
     scale = found["effects"]["optitrack_scale"]
-    assert abs(scale["estimate"][0]) < scale["sigma"][0] / 2
+    assert abs(scale["estimate"][0]) < scale["sigma"][0] / 10
