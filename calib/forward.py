@@ -17,6 +17,7 @@ import numpy as np
 from calib.effects import Effect, OneHot, Site, View
 from calib.rig import Rig
 from chains import se3
+from chains.errors import NoColumnError
 
 Values = Mapping[str, np.ndarray]
 # Names of stops' own unknowns where several stops are taken together: a value for each stop.
@@ -40,8 +41,15 @@ class Term:
     rig: str = ""  # that it belongs to alone, as `named` has it
 
     def basis(self, view: View) -> np.ndarray | OneHot:
-        """The effect's basis, of the free parameters only."""
-        basis = self.effect.basis(view)
+        """The effect's basis, of the free parameters only.
+
+        Raises:
+            NoColumnError: the effect looks at a column that there is not.
+        """
+        try:
+            basis = self.effect.basis(view)
+        except NoColumnError as error:
+            raise NoColumnError(f"effect '{self.effect.name}': {error}") from None
         if not isinstance(basis, OneHot):
             return basis if len(self.free) == basis.shape[-1] else basis[..., self.free]
         column = np.full(basis.size + 1, -1)  # the last stands for index -1: none

@@ -17,6 +17,10 @@ class CutShortError(InputError):
     """What was asked was right, and something else ended it: the same command may go on later."""
 
 
+class NoColumnError(InputError):
+    """A recording has not the column that an effect looks at."""
+
+
 LONGEST_NAME = 80  # bytes: tables are called RIG.STOP.parquet, and file systems take 255
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.rig import Rig
 from chains import se3
-from chains.errors import InputError
+from chains.errors import NoColumnError
 
 SHAPE_STEP = 0.01  # relative, to either side, for the derivative by a shape
 
@@ -78,7 +78,7 @@ class View:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.columns:
             known = ", ".join(sorted(self.columns))
-            raise InputError(f"column '{name}' is not in this recording, which has {known}.")
+            raise NoColumnError(f"column '{name}' is not in this recording, which has {known}.")
         column = self.columns[name]
         return column() if callable(column) else column
 

@@ -157,12 +157,13 @@ def _tracker_bases(part: SourceStops) -> _Added:
     source = part.source
     view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
     terms = [t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens]
-    of_place = [t for t in terms if "tracked" in t.effect.covariates]
+    of_place = {t.variable: t for t in terms if "tracked" in t.effect.covariates}
+    bases = {t.variable: t.basis(view) for t in terms}  # of all: who lacks a column is told here
     return _Added(
-        bases={t.variable: t.basis(view) for t in terms if "tracked" not in t.effect.covariates},
-        of_place={t.variable: t for t in of_place},
+        bases={t.variable: bases[t.variable] for t in terms if t.variable not in of_place},
+        of_place=of_place,
         view=view,
-        columns={*chain(*(t.effect.covariates for t in of_place))} & {*source.columns},
+        columns={*chain(*(t.effect.covariates for t in of_place.values()))} - {"joints"},
     )
 
 

@@ -70,7 +70,7 @@ from calib.runs.stored import RUN_FORMAT
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains import remote
-from chains.errors import InputError
+from chains.errors import InputError, NoColumnError
 from sensors.documents import write_json, write_yaml
 
 
@@ -108,7 +108,15 @@ def calibrate(
         choices = _Choices(Path(out), hold_out, folds, prior)
         document = _model_document(sources, model, choices)
         with going_on(outputs.kept(folder, document)):
-            _fit(sources, model, document, folder, choices, progress)
+            try:
+                _fit(sources, model, document, folder, choices, progress)
+            except NoColumnError as error:
+                if not prior:
+                    raise
+                raise NoColumnError(
+                    f"{error} (Without --effects the model has the effects of --prior {prior}; "
+                    "with it, those that you name.)"
+                ) from None
     return Run.open(out, trust_in(model.effects))
 
 
@@ -210,7 +218,7 @@ def _fit(
     """Estimate, judge by what was held out, and write the run."""
     began, progress = time.monotonic(), staged(progress, FIT)
     before = Run.open(choices.prior) if choices.prior else None
-    problem = _problem(sources, model, choices)
+    problem = problems.build(sources, model)
     held = earlier(problem, before.solution) if before else None
     links: list[Link] = []
     if held is None:
@@ -254,19 +262,6 @@ def _fit(
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
-
-
-def _problem(sources: Sequence[Source], model: Model, choices: _Choices) -> Problem:
-    """What is to be solved; what an effect lacks may be asked for by the run that is the prior."""
-    try:
-        return problems.build(sources, model)
-    except InputError as error:
-        if not choices.prior or choices.grown_from:
-            raise
-        raise InputError(
-            f"{error} (Without --effects the model has the effects of --prior {choices.prior}; "
-            "with it, those that you name.)"
-        ) from None
 
 
 def _refuse_twice(recordings: Sequence[Path]) -> None:

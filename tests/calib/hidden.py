@@ -10,6 +10,7 @@ from calib.effects import View, find
 from calib.forward import Term, place
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
+from calib.residuals.targets import HangingTarget
 from calib.rig import Rig
 from calib.simulation import Spec
 
@@ -67,6 +68,10 @@ def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.
     values[source.rig.reference_frame] = T_opti_faro
     for stop, at in truth["stops"].items():
         values[f"root@{stop}"] = T_opti_faro @ np.array(at["T_faro_root"])
+    for target in (b for b in problem.blocks if isinstance(b, HangingTarget) and name in b.tracked):
+        values[target.gravity] = -T_opti_faro[:3, 2]
+        sphere = T_opti_faro[:3, :3] @ target.faro_m + T_opti_faro[:3, 3]
+        values[target.marker] = sphere - target.below_m * values[target.gravity]
     term = next(t for t in problem.terms[0] if t.variable == name)
     theta = np.array(truth["effects"][name])[term.free]
     return problem, {**values, name: theta}, theta
