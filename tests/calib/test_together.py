@@ -74,7 +74,8 @@ def test_bodies_together_are_each_bodys_own_rows(case, points):
 def test_effects_of_the_tracker_move_bodies(case):
     """Lest the comparison above compare nothing."""
     problem, _ = case
-    names = {n for b in problem.blocks if isinstance(b, TrackedBody) for n in b.by_place.terms}
+    bodies = [b for b in problem.bodies if b.by_place]
+    names = {n for b in bodies for n in b.by_place.terms}
     assert names == (set(TRACKER) & set(problem.variables))
 
 
