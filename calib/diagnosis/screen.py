@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -154,17 +154,18 @@ def looked(smallest: np.ndarray) -> float:
     return max(1.0, float(np.log1p(-QUANTILE) / np.log1p(-min(max(limit, 1e-12), QUANTILE))))
 
 
-def rivals(screen: Screen, best: Candidate, scale: float) -> list[Candidate]:
+def rivals(
+    screen: Screen, best: Candidate, log_odds: Callable[[Candidate], float]
+) -> list[Candidate]:
     """Candidates that are expected to predict other rows about as well as the best one, or better.
 
     Args:
         screen: the look at which all of them were missing.
         best: the leading candidate.
-        scale: how much wider than their sigmas allow rows scatter once it is in the model.
+        log_odds: log of how much likelier other rows are expected to be with that than with each.
     """
-    own = best.test.log_score(scale)
     others = (c for c in screen.candidates if c.effect.family != best.effect.family)
-    return [c for c in others if own - c.test.log_score(scale) < ODDS]
+    return [c for c in others if log_odds(c) < ODDS]
 
 
 def angle_deg(screen: Screen, a: Candidate, b: Candidate) -> float:

@@ -261,6 +261,11 @@ def test_the_log_score_is_what_other_rows_gain_by_a_fit(name, size):
     assert sigma < 1.5  # of the price of 1 to 39
 
 
+def than(best):
+    """Log odds of the best one against another."""
+    return lambda other: best.test.log_score(1.0) - other.test.log_score(1.0)
+
+
 def test_what_explains_as_much_with_more_parameters_is_a_rival(monkeypatch):
     """It is none by the price that ranks candidates, which favours few parameters the more, the
     larger an effect is."""
@@ -272,17 +277,18 @@ def test_what_explains_as_much_with_more_parameters_is_a_rival(monkeypatch):
     best, other = found.candidates
     assert best.effect.name == "several"
     assert best.evidence - other.evidence > ODDS
-    assert rivals(found, best, 1.0) == [other]
+    assert rivals(found, best, than(best)) == [other]
 
 
 def test_a_twin_is_a_rival_and_another_effect_is_none():
     found = named(World(8, one=0.4))
     best = found.candidates[0]
     assert best.effect.name in ("one", "twin")
-    others = [c.effect.name for c in rivals(found, best, 1.0)]
+    others = [c.effect.name for c in rivals(found, best, than(best))]
     assert set(others) <= {"one", "twin"}
     clear = named(World(8, several=0.3))
-    assert rivals(clear, clear.candidates[0], 1.0) == []
+    best = clear.candidates[0]
+    assert rivals(clear, best, than(best)) == []
 
 
 @pytest.mark.parametrize("q", [1, 5, 60])

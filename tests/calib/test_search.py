@@ -10,6 +10,7 @@ import pytest
 from calib.diagnosis import search as steps
 from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
+from calib.diagnosis.search.named import Rival
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.verdict.matters import Consequences
 from calib.effects import GEOMETRY, find
@@ -191,19 +192,9 @@ def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
 ):
     """That something is missing is confirmed; which of two of one parameter it is, the odds say."""
 
-    def candidate(name, evidence, dof):
-        return SimpleNamespace(
-            effect=find(name), test=SimpleNamespace(evidence=lambda scale: evidence, dof=dof)
-        )
-
-    named, rival = candidate("range_scale", 10.0, 1), candidate("optitrack_scale", 10.0 + more, dof)
-    step = SimpleNamespace(
-        candidate=named,
-        rivals=[rival],
-        p_adjusted=0.01,
-        after=SimpleNamespace(named=SimpleNamespace(common=1.0)),
-        judged=SimpleNamespace(inflation=1.0),
-    )
+    named, rival = (SimpleNamespace(test=SimpleNamespace(dof=each)) for each in (1, dof))
+    rivals = [Rival(rival, log_odds=-more, more=more)]
+    step = SimpleNamespace(candidate=named, rivals=rivals, p_adjusted=0.01)
     asked = []
     monkeypatch.setattr(steps, "_fitted", lambda *a, sure: asked.append((a[1], sure)) or [rival])
     found = steps._by_likelier(None, step, [], None)

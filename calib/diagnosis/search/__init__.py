@@ -15,7 +15,7 @@ import numpy as np
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.score import evidence
-from calib.diagnosis.screen import ODDS, Candidate, rivals
+from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
     judged,
@@ -25,7 +25,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
-from calib.diagnosis.search.named import NamedEffect
+from calib.diagnosis.search.named import Compared, NamedEffect
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.stand import Look, Stand, tried
@@ -368,13 +368,14 @@ def _fitted(
     after = stand.look(progress)
     if instead and any(b.found for b in after.blunders):
         return []
+    scale = max(after.named.common, test.inflation)
     step = NamedEffect(
         candidate=replace(finest, p_value=min(test.p_value(), p)),
         before=before,
         after=after,
         judged=test,
         p_adjusted=p,
-        rivals=rivals(before.named, finest, max(after.named.common, test.inflation)),
+        rivals=Compared(look, candidate, before, finest, scale).rivals(),
     )
     return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
 
@@ -382,7 +383,5 @@ def _fitted(
 def _likelier(step: NamedEffect) -> Candidate | None:
     """A rival that explains more than the named effect does, beyond the odds of chance, where rows
     scatter as they do with that in the model."""
-    scale = max(step.after.named.common, step.judged.inflation)
-    best = max(step.rivals, key=lambda c: c.test.evidence(scale), default=step.candidate)
-    more = best.test.evidence(scale) - step.candidate.test.evidence(scale)
-    return best if more > ODDS else None
+    best = max(step.rivals, key=lambda rival: rival.more, default=None)
+    return best.candidate if best and best.more > ODDS else None

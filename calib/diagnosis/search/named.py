@@ -6,9 +6,65 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from calib.diagnosis.score import ScoreTest
-from calib.diagnosis.screen import Candidate
+from calib.diagnosis.screen import Candidate, rivals
+from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Look
 from calib.effects import Effect
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A candidate that explains about as much as an effect that was named, or more.
+
+    Args:
+        candidate: which.
+        log_odds: log of how much likelier other rows are expected to be with the one named.
+        more: evidence that it has beyond that of the one named.
+    """
+
+    candidate: Candidate
+    log_odds: float
+    more: float
+
+    @property
+    def effect(self) -> Effect:
+        return self.candidate.effect
+
+
+class Compared:
+    """An effect that is to be named, against others at the same look; of each the likeliest part.
+
+    Others are known in shapes of the grid alone. So one that has a shape is compared with the
+    effect in its own shape on the grid.
+
+    Args:
+        look: at which all of them were missing.
+        candidate: the effect, in the best shape of the grid.
+        before: the look with the effect in its best shape.
+        finest: the effect, in that.
+        scale: how much wider than their sigmas allow rows scatter once it is in the model.
+    """
+
+    def __init__(
+        self, look: Look, candidate: Candidate, before: Look, finest: Candidate, scale: float
+    ) -> None:
+        self.look, self.scale, self.finest = look, scale, finest
+        self.own = likeliest_part(before, finest, scale)
+        self.on_grid = likeliest_part(look, candidate, scale)
+
+    def rivals(self) -> list[Rival]:
+        """The others that explain as much."""
+        some = rivals(self.look.named, self.finest, lambda other: self._rival(other).log_odds)
+        return [self._rival(other) for other in some]
+
+    def _rival(self, other: Candidate) -> Rival:
+        own = self.on_grid if other.effect.shape_name else self.own
+        part, scale = likeliest_part(self.look, other, self.scale), self.scale
+        return Rival(
+            candidate=other,
+            log_odds=own.log_score(scale) - part.log_score(scale),
+            more=part.evidence(scale) - own.evidence(scale),
+        )
 
 
 @dataclass(frozen=True)
@@ -20,7 +76,7 @@ class NamedEffect:
         before, after: the looks before it was fitted and after.
         judged: its test with clusters jackknifed.
         p_adjusted: as judged, or of the blunders in whose place it stands.
-        rivals: candidates that explain as much, and what to tell them apart by.
+        rivals: candidates that explain as much.
     """
 
     candidate: Candidate
@@ -28,7 +84,7 @@ class NamedEffect:
     after: Look
     judged: ScoreTest
     p_adjusted: float
-    rivals: Sequence[Candidate]
+    rivals: Sequence[Rival]
 
     @property
     def effect(self) -> Effect:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.diagnosis.score import evidence, score_test
+from calib.diagnosis.score import evidence, log_score, score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.stand import Look
 
@@ -33,6 +33,10 @@ class Explained:
     def evidence(self, common: float) -> float:
         """As of `ScoreTest.evidence`, less the price."""
         return evidence(self.statistic, self.dof, common) - self.price
+
+    def log_score(self, common: float) -> float:
+        """As of `ScoreTest.log_score`."""
+        return log_score(self.statistic, self.dof, common)
 
 
 def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained:

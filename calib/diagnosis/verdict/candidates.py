@@ -11,6 +11,7 @@ from calib.diagnosis.everywhere import Everywhere
 from calib.diagnosis.screen import Candidate, angle_deg
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_NOISE
+from calib.diagnosis.search.named import Rival
 from calib.diagnosis.suggest import what_separates
 from calib.diagnosis.verdict.matters import Weighed
 from calib.effects import Site
@@ -123,16 +124,14 @@ def _shares(fall: Fall | None) -> dict[str, float | None]:
 def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     screen, family = step.before.named, step.effect.family
     on_grid = next((c for c in screen.candidates if c.effect.family == family), step.candidate)
-    scale = max(step.after.named.common, step.judged.inflation)
-    own = step.candidate.test.log_score(scale)
     alike = {other.effect.name for other in step.rivals if _alike(step, other)}
     return [
         {
             "effect": other.effect.family,
             "add": other.effect.name,
-            "dof": other.test.dof,
-            "angle_deg": angle_deg(screen, on_grid, other),
-            "odds": float(np.exp(own - other.test.log_score(scale))),
+            "dof": other.candidate.test.dof,
+            "angle_deg": angle_deg(screen, on_grid, other.candidate),
+            "odds": float(np.exp(other.log_odds)),
             "separate": (
                 ALIKE if other.effect.name in alike else what_separates(step.effect, other.effect)
             ),
@@ -142,7 +141,7 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
     ]
 
 
-def _alike(step: NamedEffect, other: Candidate) -> bool:
+def _alike(step: NamedEffect, other: Rival) -> bool:
     """Whether an effect and a rival move alike all that is seen, at every pose of the arm."""
     both = (step.effect, other.effect)
     if not all(effect.site in (Site.EDGE, Site.JOINTS) for effect in both):

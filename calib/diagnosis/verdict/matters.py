@@ -209,7 +209,7 @@ def borne_out(fall: Fall | None) -> bool:
 def _more_general(step: NamedEffect) -> str:
     """A rival with more parameters, which explains as much at its price; empty without any."""
     own = step.candidate.test.dof
-    return next((r.effect.name for r in step.rivals if r.test.dof > own), "")
+    return next((r.effect.name for r in step.rivals if r.candidate.test.dof > own), "")
 
 
 def _sentence(what: str, candidate: Candidate, screen: Screen, told: Matters) -> str:
