@@ -49,6 +49,8 @@ class Term:
         try:
             basis = self.effect.basis(view)
         except NoColumnError as error:
+            if f"'{self.effect.name}'" in str(error):  # as formulas say
+                raise
             raise NoColumnError(f"effect '{self.effect.name}': {error}") from None
         if not isinstance(basis, OneHot):
             return basis if len(self.free) == basis.shape[-1] else basis[..., self.free]

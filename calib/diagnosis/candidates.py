@@ -139,6 +139,10 @@ class PoseShape(Effect):
         return self.slips.of_lidar
 
     @property
+    def goes_by_place(self) -> bool:
+        return self.slips.goes_by_place
+
+    @property
     def what(self) -> str:
         """What is moved: mount, body, base or tracker."""
         return self.slips.family.removesuffix("_slip")

@@ -33,7 +33,8 @@ class Site(Enum):
     BEAM = "beam"  # (3,) range m, azimuth rad, elevation rad; a row per point
     JOINTS = "joints"  # (J,) rad or m, what each encoder reports; a row per stop
     EDGE = "edge"  # (E, 6) twist of every edge of the frame tree; a row per stop
-    TRACKER = "tracker"  # (B, 6) twist of every tracked body as seen; a row per stop
+    TRACKER = "tracker"  # (B, 6) twist of every tracked body as seen; a row per stop. Of what is
+    # `of_volume` also (2, 6), of the lower and the upper marker of targets; a row per target
     TARGET = "target"  # (3,) m, sphere centre on its rod, tracker frame; a row per target
     REFERENCE = "reference"  # (3,) m, where the surface is, reference frame; a row per point, and
     # per sphere of what hangs on the place alone: the scanner's error, which scanned both
@@ -60,6 +61,7 @@ class View:
 
     Columns of a point are those of its stop too. Range and incidence are those *predicted* by the
     model, never the measured ones: noise common to a column and its residual looks like an effect.
+    Likewise `tracked` has the body that is asked about where the model has it; others as measured.
     Intensity is that over the median of all recordings by one LiDAR, so that no unit matters.
 
     Args:
@@ -118,7 +120,8 @@ class Effect(ABC):
         name: as in commands and files; with a chosen shape ``family@shape``.
         site: where it acts.
         covariates: columns of the view that its basis looks at; "joints" are the reported joints.
-            Where a recording lacks one, the effect cannot be tested.
+            Where a recording lacks one, the effect cannot be tested. The basis of one that looks at
+            "tracked", at the tracker's site, is computed anew wherever a fit has the body.
         unit: of its parameters, of all of them if they differ; of revolute joints.
         formula, typical, confounded_with, source: the catalogue's page.
         shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
@@ -126,6 +129,8 @@ class Effect(ABC):
         whole: True where a shape is a whole number.
         jumps: True where the basis jumps with the shape, as at the time when something slipped.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
+        of_volume: True where it is the tracker's error at a place, which markers of targets have as
+            well.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
         by_chance: True where its parameters are drawn by chance, and their spread is estimated.
         widens: of those, True where the rows that it acts on get a wider sigma instead of values.
@@ -145,6 +150,7 @@ class Effect(ABC):
     shape: float = 0.0
     whole: ClassVar[bool] = False
     jumps: ClassVar[bool] = False
+    of_volume: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
     widens: ClassVar[bool] = False
     seen: Mapping[str, tuple[float, float]] = MappingProxyType({})
@@ -156,9 +162,9 @@ class Effect(ABC):
         return self.site is Site.REFERENCE and self.covariates == ("point_m",)
 
     @property
-    def of_volume(self) -> bool:
-        """Whether it is the tracker's error at a place, which markers of targets have as well."""
-        return self.site is Site.TRACKER and self.covariates == ("tracked",)
+    def goes_by_place(self) -> bool:
+        """Whether its basis looks at where a tracked body is."""
+        return "tracked" in self.covariates
 
     @property
     def goes_with_time(self) -> bool:
@@ -215,7 +221,8 @@ class Effect(ABC):
 
     @abstractmethod
     def basis(self, view: View) -> Basis:
-        """Error at the site per unit of each parameter.
+        """Error at the site per unit of each parameter. A row depends on what the view has of that
+        row alone, as rows come in any order and number.
 
         Returns:
             (rows, *shape of the site, P), or a `OneHot`. One row stands for all where the basis
@@ -256,6 +263,14 @@ class ShapeStep(Effect):
     @property
     def of_lidar(self) -> bool:
         return self.effect.of_lidar
+
+    @property
+    def of_volume(self) -> bool:
+        return self.effect.of_volume
+
+    @property
+    def goes_by_place(self) -> bool:
+        return self.effect.goes_by_place
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         there = rig.name in self.theta and bool(self.effect.params(rig))

@@ -21,6 +21,7 @@ class OptitrackScale(Effect):
 
     name = "optitrack_scale"
     site = Site.TRACKER
+    of_volume = True
     unit = "1"
     formula = "position of a body or marker = true + s * true, tracker frame"
     typical = "100 to 1000 ppm, size assumed"
@@ -41,6 +42,7 @@ class OptitrackDistortion(Effect):
 
     name = "optitrack_distortion"
     site = Site.TRACKER
+    of_volume = True
     unit = "m"
     formula = (
         "position p of a body or marker = true + sum of c_ijk p_j p_k / (3 m)^2, tracker frame"
@@ -138,7 +140,7 @@ class TrackerSlip(MountSlip):
     def moved(self, view: View, by: np.ndarray) -> np.ndarray:
         """The tracker's frame moves by the twist, and each body in its own axes.
 
-        Column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
+        Column ``tracked`` (K, B, 4, 4) says where bodies are, tracker frame; NaN where not seen.
         """
         T_body_opti = se3.inverse(np.nan_to_num(view["tracked"]))
         return by[:, None, None, None] * se3.adjoint(T_body_opti)
@@ -173,7 +175,7 @@ class TrackerSettle(MountSettle, TrackerSlip):
 def _in_body(view: View, field: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """The twists (K, B, 6, P) of shifts (N, 3, P) that depend on where (N, 3) a body is.
 
-    Column ``tracked`` (K, B, 4, 4) holds the bodies' poses, NaN where not seen.
+    Column ``tracked`` (K, B, 4, 4) says where bodies are, tracker frame; NaN where not seen.
     """
     T = np.nan_to_num(view["tracked"])
     shift = field(T[..., :3, 3].reshape(-1, 3))

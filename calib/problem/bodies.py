@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
@@ -136,19 +135,18 @@ class _Added:
     Args:
         bases: unknown -> (K or 1, B, 6, P).
         of_place: unknown -> the effect, of those that go by where the model has a body.
-        view: all that effects look at, of which these look at `columns`.
+        view: what effects look at.
     """
 
     bases: Mapping[str, np.ndarray]
     of_place: Mapping[str, Term]
     view: View
-    columns: Collection[str]
 
     def by_place(self, index: np.ndarray, number: int) -> ByPlace | None:
         """What goes by the place of a body at some stops."""
         if not self.of_place:
             return None
-        columns = {name: self.view[name][index] for name in self.columns}
+        columns = {name: column[index] for name, column in self.view.columns.items()}
         view = View(self.view.rig, len(index), columns, self.view.joints[index])
         return ByPlace(self.of_place, view, number)
 
@@ -157,13 +155,12 @@ def _tracker_bases(part: SourceStops) -> _Added:
     source = part.source
     view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
     terms = [t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens]
-    of_place = {t.variable: t for t in terms if "tracked" in t.effect.covariates}
+    of_place = {t.variable: t for t in terms if t.effect.goes_by_place}
     bases = {t.variable: t.basis(view) for t in terms}  # of all: who lacks a column is told here
     return _Added(
         bases={t.variable: bases[t.variable] for t in terms if t.variable not in of_place},
         of_place=of_place,
         view=view,
-        columns={*chain(*(t.effect.covariates for t in of_place.values()))} - {"joints"},
     )
 
 
@@ -191,7 +188,11 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
         )
     )
     view = View.of_places(part.source.rig, np.stack([lower_m, upper_m], axis=1))
-    tracked = {t.variable: t.basis(view)[:, :, 3:] for t in part.terms if t.effect.of_volume}
+    tracked = {
+        t.variable: np.broadcast_to(b := t.basis(view)[:, :, 3:], (shape[0], *b.shape[1:]))
+        for t in part.terms
+        if t.effect.of_volume
+    }
     for m, name in enumerate(targets.names):
         marker = vector_unknown(
             f"{part.prefix}target:{name}",

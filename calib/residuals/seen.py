@@ -59,10 +59,10 @@ class ByPlace:
     def turned(self, T_world_body: np.ndarray, values: Values) -> np.ndarray:
         """Derivative (K, 6, 6) of what is added by the body's right increment."""
         out = np.zeros((len(T_world_body), 6, 6))
-        if not any(np.any(values[v]) for v in self.terms):
-            return out
-        for i, step in enumerate(STEP * np.eye(6)):
-            ends = (self.bases(T_world_body @ se3.exp(by)) for by in (step, -step))
+        there = {v: term for v, term in self.terms.items() if np.any(values[v])}
+        for i, step in enumerate(STEP * np.eye(6) if there else ()):
+            some = replace(self, terms=there)
+            ends = (some.bases(T_world_body @ se3.exp(by)) for by in (step, -step))
             after, before = (sum(b @ values[v] for v, b in end.items()) for end in ends)
             out[:, :, i] = (after - before) / (2 * STEP)
         return out
@@ -71,7 +71,8 @@ class ByPlace:
     def together(cls, some: Sequence[ByPlace]) -> ByPlace:
         """Of stops that share every variable, taken together."""
         first, views = some[0], [each.view for each in some]
-        columns = {n: np.concatenate([v[n] for v in views]) for n in first.view.columns}
+        known = [n for n in first.view.columns if all(n in v.columns for v in views)]
+        columns = {n: np.concatenate([v[n] for v in views]) for n in known}
         joints = np.concatenate([v.joints for v in views])
         view = View(first.view.rig, sum(v.rows for v in views), columns, joints)
         return cls(first.terms, view, first.number)

@@ -1,5 +1,7 @@
 """Readings of joints scatter, each joint's by its own; against a dense likelihood."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize
@@ -44,6 +46,23 @@ def parts(rng, sd, count=40, joints=3):
         y = J @ (sd * rng.normal(size=joints)) + rng.normal(size=2)
         found.append(Told(J.T @ y, J.T @ J, np.arange(joints)))
     return ToldApart(found)
+
+
+def test_stops_with_rows_of_some_kinds_count_for_these():
+    """Stops whose groups are the same are told of together, and each stop alone says the same."""
+    rng, least = np.random.default_rng(4), np.full(3, 0.1)
+    some = [*parts(rng, np.array([3.0, 0.5, 2.0])).parts]
+    some += [each.of(0, 2) for each in some[:10]]
+    some[-10:] = [replace(each, group=2 * each.group) for each in some[-10:]]
+    some += [replace(each.of(1), group=np.array([1])) for each in some[:3]]
+    apart, together = ToldApart(some), ToldApart.at_stops(some)
+    assert len(together.parts) == 3
+    for of in ((0, 1, 2), (2,), (1, 0)):
+        each, stacked = apart.of(*of), together.of(*of)
+        sd = each.spread(least[: len(of)])
+        np.testing.assert_allclose(stacked.spread(least[: len(of)]), sd, rtol=1e-6)
+        np.testing.assert_allclose(stacked.sigma(sd), each.sigma(sd), rtol=1e-9)
+        assert stacked.statistic(sd) == pytest.approx(each.statistic(sd), rel=1e-9)
 
 
 def test_spreads_of_all_joints_have_the_greatest_likelihood_that_bounds_allow():

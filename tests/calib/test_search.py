@@ -20,6 +20,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import stand_of
 from chains import se3
 
+from ..bench import arm_effects
 from . import arm_worlds
 from .simulated import made
 
@@ -182,6 +183,15 @@ def test_effects_see_bodies_where_the_model_has_them(tmp_path):
     measured = [np.linalg.norm(b.measured[0, :3, 3]) for b in problem.bodies]
     true = np.linalg.norm(seen.translation, axis=1)
     assert np.std(shift - true) < 0.5 * np.std(measured - true)
+
+
+@pytest.mark.parametrize("arm", ["ur5e", "irb120"])
+def test_a_joint_that_slipped_is_not_the_tracker_or_the_mount(tmp_path, arm):
+    """What the first joint does to all that is seen a tracker that moved may do as well, and what
+    the last does, the mount: with six parameters for one."""
+    arm_effects.written(tmp_path, (arm, "joint slip", 1.0, 300))
+    done = search(stand_of(calibrate([tmp_path], tmp_path / "run", hold_out="none"), quiet), quiet)
+    assert [step.effect.family for step in done.found] == ["arm_joint_slip"]
 
 
 @pytest.mark.parametrize(

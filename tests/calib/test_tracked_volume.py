@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 import yaml
 
-from calib.effects import find
+from calib.diagnosis.candidates import PoseShape
+from calib.effects import Effect, Param, ShapeStep, Site, find
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.residuals.targets import HangingTarget
@@ -48,6 +49,42 @@ def test_derivatives_of_targets_by_errors_of_the_tracker(problem, values):
     assert set(targets[0].tracked) == set(OF_PLACE[:2])
     for target in targets:
         rigs.assert_block_derivatives(target, problem.variables, values)
+
+
+def test_what_is_made_of_an_effect_goes_by_the_place_as_that_does():
+    creep, scale = find("tracker_creep"), find("optitrack_scale")
+    settle = find("tracker_settle").at(500.0)
+    step = ShapeStep(settle, {"box": np.ones(6)})
+    assert all(e.goes_by_place and not e.of_volume for e in (creep, settle, step))
+    assert ShapeStep(scale, {"box": np.ones(1)}).of_volume
+    assert PoseShape(find("tracker_slip").at(9.0), "time_s", (0.0, 1.0), 2).goes_by_place
+    assert not PoseShape(find("mount_slip").at(9.0), "time_s", (0.0, 1.0), 2).goes_by_place
+
+
+class Mine(Effect):
+    """Of a user, about the second body alone."""
+
+    name, site, covariates = "mine", Site.TRACKER, ("tracked",)
+
+    def params(self, rig):
+        return (Param("along", "m", 0.01),)
+
+    def basis(self, view):
+        out = np.zeros((view.rows, len(view.rig.tracker.bodies), 6, 1))
+        out[:, 1, 3] = np.sin(view["elapsed_s"])[:, None]
+        return out
+
+
+def test_an_effect_of_a_user_moves_bodies_alone_and_sees_all_columns(tmp_path):
+    source = Source.open(rigs.write(tmp_path / "box"))
+    problem = build([source], Model((Mine(),)))
+    assert not any("mine" in b.variables for b in problem.blocks if isinstance(b, HangingTarget))
+    values = problem.initial | {"mine": np.array([0.01])}
+    for body in problem.bodies:
+        (moved, _), (still, _) = (body.evaluate(v, False) for v in (values, problem.initial))
+        elapsed = source.columns["elapsed_s"][[k for _, k in body.stop_names]]
+        second = body.body == source.rig.tracker.bodies[1]
+        assert np.allclose(moved, still) == (not second or np.allclose(np.sin(elapsed), 0))
 
 
 def test_bodies_and_targets_are_seen_by_the_same_metre(problem, values):

@@ -25,7 +25,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
-from calib.diagnosis.search.named import Compared, NamedEffect
+from calib.diagnosis.search.named import AgainstOthers, NamedEffect
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.stand import Look, Stand, tried
@@ -36,6 +36,9 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
+# Log odds from which a rival takes the name: evidence of 150 to 1 is called very strong (Kass and
+# Raftery 1995, JASA 90).
+FAR_MORE = np.log(150.0)
 
 
 @dataclass(frozen=True)
@@ -375,13 +378,13 @@ def _fitted(
         after=after,
         judged=test,
         p_adjusted=p,
-        rivals=Compared(look, candidate, before, finest, scale).rivals(),
+        rivals=AgainstOthers(look, candidate, before, finest, scale).rivals(),
     )
     return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
 
 
 def _likelier(step: NamedEffect) -> Candidate | None:
-    """A rival that explains more than the named effect does, beyond the odds of chance, where rows
-    scatter as they do with that in the model."""
+    """A rival that explains far more than the named effect does, where rows scatter as they do with
+    that in the model."""
     best = max(step.rivals, key=lambda rival: rival.more, default=None)
-    return best.candidate if best and best.more > ODDS else None
+    return best.candidate if best and best.more > FAR_MORE else None

@@ -31,7 +31,7 @@ class Rival:
         return self.candidate.effect
 
 
-class Compared:
+class AgainstOthers:
     """An effect that is to be named, against others at the same look; of each the likeliest part.
 
     Others are known in shapes of the grid alone. So one that has a shape is compared with the

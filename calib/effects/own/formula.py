@@ -14,7 +14,7 @@ from calib.effects.basis import finite
 from calib.effects.own.expression import ALIASES, Expression
 from calib.effects.rig import DOF
 from calib.rig import Rig
-from chains.errors import InputError
+from chains.errors import InputError, NoColumnError
 from sensors.documents import Document, Marks, Number, nearest, plain, validate
 
 BEAM_AXES = {"range": 0, "azimuth": 1, "elevation": 2}
@@ -174,7 +174,8 @@ class FormulaEffect(Effect):
             if name not in view.columns:
                 # Columns of several numbers a row are for code, not for formulas.
                 known = [n for n, c in view.columns.items() if callable(c) or np.ndim(c) == 1]
-                raise expression.wrong(f"there is no column {name} here{nearest(name, known)}")
+                said = expression.wrong(f"there is no column {name} here{nearest(name, known)}")
+                raise NoColumnError(str(said))
             values = np.asarray(view[name])
             if values.dtype.kind not in "biuf":
                 raise expression.wrong(f"column {name} holds names, not numbers")

@@ -63,7 +63,7 @@ def walk_of(effect: Effect, rig: Rig) -> Walk | None:
     if "elapsed_s" in over:
         return _along(rig, "elapsed_s")
     if over == ["tracked"]:
-        return _places(rig, "tracked", "x of a body in the tracker's frame, m", TRACKED)
+        return _places(rig, "tracked", "x of a body or marker in the tracker's frame, m", TRACKED)
     if over == ["point_m"]:
         return _places(rig, "point_m", "x of a point in the reference's frame, m", ROOM_POINT)
     if not over and effect.site is Site.TARGET:

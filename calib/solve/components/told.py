@@ -149,7 +149,7 @@ class ToldApart:
 
 def _summed(values: np.ndarray, axes: int = 1) -> np.ndarray:
     """Over all stops: over all but the last axes."""
-    return values.reshape(-1, *values.shape[values.ndim - axes :]).sum(axis=0)
+    return values.sum(axis=tuple(range(values.ndim - axes)))
 
 
 def _likeliest(
