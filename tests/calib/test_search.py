@@ -189,8 +189,10 @@ def test_effects_see_bodies_where_the_model_has_them(tmp_path):
 def test_a_joint_that_slipped_is_not_the_tracker_or_the_mount(tmp_path, arm):
     """What the first joint does to all that is seen a tracker that moved may do as well, and what
     the last does, the mount: with six parameters for one."""
-    arm_effects.written(tmp_path, (arm, "joint slip", 1.0, 300))
-    done = search(stand_of(calibrate([tmp_path], tmp_path / "run", hold_out="none"), quiet), quiet)
+    folder = tmp_path / "rec"
+    folder.mkdir()
+    arm_effects.written(folder, (arm, "joint slip", 1.0, 300))
+    done = search(stand_of(calibrate([folder], tmp_path / "run", hold_out="none"), quiet), quiet)
     assert [step.effect.family for step in done.found] == ["arm_joint_slip"]
 
 
