@@ -28,6 +28,7 @@ from calib.diagnosis.search.mishaps import adapted, restored
 from calib.diagnosis.search.named import AgainstOthers, NamedEffect
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.search.shapes import retuned
+from calib.diagnosis.search.sways import Sways, sways
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.solve.fit import Progress
 
@@ -69,6 +70,7 @@ class Search:
     unsettled: Chance | None = None
     beside: Look | None = None
     scatter_judged: bool = False
+    sways: Sways | None = None
 
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
@@ -167,6 +169,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         chance=[c for c in still if c.found],
         unsettled=unsettled,
     )
+    by_chance = [*done.chance, *([done.unsettled] if done.unsettled else [])]
+    done = replace(done, sways=sways(done.looks[-1].stand, by_chance, progress))
     if done.chance and done.unnamed and structures(plain[0][0], progress):
         done = _without_chance(done, plain, progress)
     if done.found and done.dressed_up(0):

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.screen import ODDS, Candidate
-from calib.diagnosis.search import NamedEffect
+from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
 from calib.diagnosis.verdict.matters import Weighed
@@ -51,13 +51,10 @@ def sentences_of(
         candidate = next(c for c in candidates if c["add"] == step.effect.name)
         if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
-    scatter = [each.sentence for each in found.chance]
-    if deferred and found.chance:
-        beside = ", ".join(each.effect.name for each in found.chance)
-        scatter = [f"Random scatter ({beside}) is judged once that structure is in the model."]
+    scatter = _scatter_sentences(found, deferred)
     told_later = deferred and verdict != UNNAMED  # after the structure that it speaks of
     out += [] if told_later else scatter
-    out += [found.unsettled.unsettled] if found.unsettled else []
+    out += [found.unsettled.unsettled] if found.unsettled and not found.sways else []
     out += [*heavy.refused, *traces]
     named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
     every = " and ".join(filter(None, [", ".join(named[:-1]), *named[-1:]]))
@@ -87,6 +84,16 @@ def sentences_of(
             f"Could not be tested on these recordings: {', '.join(gone[:MOST_LISTED])}{more}."
         )
     return out
+
+
+def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
+    """What is said of scatter by chance; of a base that sways in its place."""
+    if found.sways:
+        return [found.sways.sentence]
+    if deferred and found.chance:
+        beside = ", ".join(each.effect.name for each in found.chance)
+        return [f"Random scatter ({beside}) is judged once that structure is in the model."]
+    return [each.sentence for each in found.chance]
 
 
 def unconfirmed(candidate: Candidate, over: float) -> str:
