@@ -15,6 +15,7 @@ import numpy as np
 from calib import problem as problems
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.stand import Stand, tried
+from calib.effects import Site
 from calib.problem.model import Source
 from calib.problem.places import standing
 from calib.solve.fit import Progress, solve
@@ -23,6 +24,7 @@ from chains import se3
 # Of what scatter explains, that is left where the base is free; a choice, below which the rest is
 # another matter.
 LEFT = 0.1
+CARRIED = (Site.TRACKER, Site.JOINTS, Site.EDGE)  # where what a base carries seems to scatter
 STILL = {"location": "at a location", "never": "at all stops"}  # as rig.yaml says
 
 
@@ -46,21 +48,22 @@ class Sways:
         """What it says, and what to do about it."""
         names = " and ".join(filter(None, [", ".join(self.names[:-1]), *self.names[-1:]]))
         return (
-            f"The base does not stand still {self.said}, as rig.yaml says. From stop to stop it "
-            f"moves by {1e3 * self.shift_m:.2f} mm and {1e3 * self.turn_rad:.2f} mrad rms, which "
-            f"seems to be {names}: where the fit lets it, that is gone. Put 'moves: stop' under "
-            "'base' in rig.yaml, so that each stop has its own place of the base."
+            f"rig.yaml says that the base stands still {self.said}, but from stop to stop it moves "
+            f"by {1e3 * self.shift_m:.2f} mm and {1e3 * self.turn_rad:.2f} mrad rms, so that what "
+            f"it carries seems to scatter ({names}). Put 'moves: stop' under 'base' in rig.yaml; "
+            "with a place of the base for each stop, next to nothing of that scatter is left."
         )
 
 
 def sways(stand: Stand, scatter: Sequence[Chance], progress: Progress) -> Sways | None:
-    """What is found in place of scatter, if that is all it is.
+    """A base whose moves explain scatter that was found; None where they do not.
 
     Args:
         stand: the model with all that is named, scatter or not.
         scatter: what was found.
         progress: as of `fit.solve`.
     """
+    scatter = [chance for chance in scatter if chance.effect.site in CARRIED]
     if not scatter or not all(map(_shows_its_base, stand.sources)):
         return None
     names = [chance.effect.name for chance in scatter]

@@ -87,9 +87,10 @@ def sentences_of(
 
 
 def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
-    """What is said of scatter by chance; of a base that sways in its place."""
+    """What is said of scatter by chance, and of a base that sways in place of some of it."""
     if found.sways:
-        return [found.sways.sentence]
+        rest = (c for c in found.chance if c.effect.name not in found.sways.names)
+        return [found.sways.sentence, *(each.sentence for each in rest)]
     if deferred and found.chance:
         beside = ", ".join(each.effect.name for each in found.chance)
         return [f"Random scatter ({beside}) is judged once that structure is in the model."]
