@@ -10,6 +10,7 @@ from scipy.stats import ttest_rel, wilcoxon
 
 from calib import add, diagnose, fit
 from calib.diagnosis.search import NamedEffect, Search
+from calib.diagnosis.search.named import Rival
 from calib.diagnosis.stand import Stand
 from calib.diagnosis.verdict import _over_the_expected, _unconfirmed, conclude
 from calib.diagnosis.verdict.matters import (
@@ -154,7 +155,7 @@ def test_a_later_name_stands_if_stops_bear_it_out_or_nothing_is_more_general(loo
                 after=look,
                 judged=candidate.test,
                 p_adjusted=1e-4,
-                rivals=[more if general else candidate],
+                rivals=[Rival(more if general else candidate, log_odds=0.0, more=0.0)],
             )
         )
     found = Search(looks=[look], found=steps, blunders=(), unnamed=(), scatter=None)
