@@ -235,12 +235,6 @@ class ScoreTest:
         ranks what candidates explain, at a price for their parameters, and decides nothing."""
         return evidence(self.statistic, self.dof, common)
 
-    def log_score(self, common: float) -> float:
-        """By how much it is expected to raise the log-likelihood of rows that it is not fitted to:
-        half of what it explains, less one for each parameter (Akaike 1974; leaving rows out gives
-        the same where there are many: Stone 1977, JRSS B 39). `common` is their inflation."""
-        return log_score(self.statistic, self.dof, common)
-
     def estimate(self) -> np.ndarray:
         """Parameters (q,) after one step; 0 along gauges."""
         return self.whiten @ (self.whiten.T @ self.score)
@@ -284,11 +278,6 @@ class ScoreTest:
 def evidence(statistic: float, dof: int, common: float) -> float:
     """As of `ScoreTest.evidence`, of a statistic in so many directions."""
     return -log_tail(statistic / max(common, 1e-300), dof)
-
-
-def log_score(statistic: float, dof: int, common: float) -> float:
-    """As of `ScoreTest.log_score`, of a statistic in so many directions."""
-    return statistic / max(common, 1e-300) / 2.0 - dof
 
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:

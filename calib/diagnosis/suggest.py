@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import count, pairwise
 from typing import Any
 
@@ -91,6 +91,11 @@ def seen(effect: Binned | JointShape) -> str:
     """From where to where each covariate of structure went, in words."""
     suffix = "_rad" if isinstance(effect, JointShape) else ""
     return " and ".join(span(name, *ends, suffix) for name, ends in effect.seen.items())
+
+
+def all_of(names: Sequence[str]) -> str:
+    """Names in a sentence: ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def span(name: str, low: float, high: float, suffix: str = "") -> str:

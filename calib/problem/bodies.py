@@ -152,6 +152,7 @@ class _Added:
 
 
 def _tracker_bases(part: SourceStops) -> _Added:
+    """What the tracker adds to every body at every stop of a recording."""
     source = part.source
     view = View(source.rig, len(source.recording.stops), source.columns, source.recording.joints)
     terms = [t for t in part.terms if t.effect.site is Site.TRACKER and not t.effect.widens]

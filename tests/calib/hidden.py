@@ -13,6 +13,7 @@ from calib.problem.model import Model, Source
 from calib.residuals.targets import HangingTarget
 from calib.rig import Rig
 from calib.simulation import Spec
+from chains import se3
 
 from .simulated import changed, made
 
@@ -70,7 +71,7 @@ def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.
         values[f"root@{stop}"] = T_opti_faro @ np.array(at["T_faro_root"])
     for target in (b for b in problem.blocks if isinstance(b, HangingTarget) and name in b.tracked):
         values[target.gravity] = -T_opti_faro[:3, 2]
-        sphere = T_opti_faro[:3, :3] @ target.faro_m + T_opti_faro[:3, 3]
+        (sphere,) = se3.apply(T_opti_faro, target.faro_m[None])
         values[target.marker] = sphere - target.below_m * values[target.gravity]
     term = next(t for t in problem.terms[0] if t.variable == name)
     theta = np.array(truth["effects"][name])[term.free]

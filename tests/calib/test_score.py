@@ -13,6 +13,7 @@ from calib.diagnosis import score
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear
 from calib.diagnosis.screen import ODDS, looked, rivals, screen
+from calib.diagnosis.search.parts import Explained
 from calib.effects import Site
 from calib.problem.unknowns import Owner
 
@@ -254,7 +255,7 @@ def test_the_log_score_is_what_other_rows_gain_by_a_fit(name, size):
         away = column - first.model @ np.linalg.lstsq(first.model, column, rcond=None)[0]
         effect = away @ (found.whiten.T @ found.score)
         fell = np.sum(np.square(again.b)) - np.sum(np.square(again.b - effect))
-        gains.append((found.log_score(1.0), fell / 2))
+        gains.append((Explained(found.statistic, found.dof).log_score(1.0), fell / 2))
     told, seen = np.mean(gains, axis=0)
     sigma = np.std(np.subtract(*np.transpose(gains))) / np.sqrt(len(gains))
     assert told == pytest.approx(seen, abs=4 * sigma)
@@ -263,7 +264,11 @@ def test_the_log_score_is_what_other_rows_gain_by_a_fit(name, size):
 
 def than(best):
     """Log odds of the best one against another."""
-    return lambda other: best.test.log_score(1.0) - other.test.log_score(1.0)
+
+    def told(candidate):
+        return Explained(candidate.test.statistic, candidate.test.dof).log_score(1.0)
+
+    return lambda other: told(best) - told(other)
 
 
 def test_what_explains_as_much_with_more_parameters_is_a_rival(monkeypatch):

@@ -25,7 +25,7 @@ from calib.diagnosis.search.confirmed import (
     suspects,
 )
 from calib.diagnosis.search.mishaps import adapted, restored
-from calib.diagnosis.search.named import AgainstOthers, NamedEffect
+from calib.diagnosis.search.named import NamedEffect, rivals_of
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.search.sways import Sways, sways
@@ -58,6 +58,7 @@ class Search:
         unsettled: what scatters beside that, and with which no fit comes to an optimum.
         beside: the last look, where blunders were judged beside formulas; see `beside_formulas`.
         scatter_judged: whether what scatters by chance was judged there, too.
+        sways: the base, if its moves explain what seems to scatter.
     """
 
     looks: Sequence[Look]
@@ -232,7 +233,8 @@ def beside_formulas(done: Search, stand: Stand, whole: bool, progress: Progress)
     done = replace(done, blunders=again.blunders, beside=again.looks[-1])
     if not whole or again.found:
         return done
-    return replace(done, chance=again.chance, unsettled=again.unsettled, scatter_judged=True)
+    by_chance = {n: getattr(again, n) for n in ("chance", "unsettled", "sways")}
+    return replace(done, **by_chance, scatter_judged=True)
 
 
 def _without_chance(done: Search, steps: Steps, progress: Progress) -> Search:
@@ -382,7 +384,7 @@ def _fitted(
         after=after,
         judged=test,
         p_adjusted=p,
-        rivals=AgainstOthers(look, candidate, before, finest, scale).rivals(),
+        rivals=rivals_of(look, candidate, before, finest, scale),
     )
     return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
 

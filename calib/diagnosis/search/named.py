@@ -31,8 +31,10 @@ class Rival:
         return self.candidate.effect
 
 
-class AgainstOthers:
-    """An effect that is to be named, against others at the same look; of each the likeliest part.
+def rivals_of(
+    look: Look, candidate: Candidate, before: Look, finest: Candidate, scale: float
+) -> list[Rival]:
+    """The candidates that explain as much as one that is to be named; of each the likeliest part.
 
     Others are known in shapes of the grid alone. So one that has a shape is compared with the
     effect in its own shape on the grid.
@@ -44,27 +46,18 @@ class AgainstOthers:
         finest: the effect, in that.
         scale: how much wider than their sigmas allow rows scatter once it is in the model.
     """
-
-    def __init__(
-        self, look: Look, candidate: Candidate, before: Look, finest: Candidate, scale: float
-    ) -> None:
-        self.look, self.scale, self.finest = look, scale, finest
-        self.own = likeliest_part(before, finest, scale)
-        self.on_grid = likeliest_part(look, candidate, scale)
-
-    def rivals(self) -> list[Rival]:
-        """The others that explain as much."""
-        some = rivals(self.look.named, self.finest, lambda other: self._rival(other).log_odds)
-        return [self._rival(other) for other in some]
-
-    def _rival(self, other: Candidate) -> Rival:
-        own = self.on_grid if other.effect.shape_name else self.own
-        part, scale = likeliest_part(self.look, other, self.scale), self.scale
-        return Rival(
+    on_grid, at_best = (likeliest_part(*of, scale) for of in ((look, candidate), (before, finest)))
+    found = {}
+    for other in look.named.candidates:
+        own = on_grid if other.effect.shape_name else at_best
+        part = likeliest_part(look, other, scale)
+        found[other.effect.name] = Rival(
             candidate=other,
             log_odds=own.log_score(scale) - part.log_score(scale),
             more=part.evidence(scale) - own.evidence(scale),
         )
+    near = rivals(look.named, finest, lambda other: found[other.effect.name].log_odds)
+    return [found[other.effect.name] for other in near]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from calib import problem as problems
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.stand import Stand, tried
+from calib.diagnosis.suggest import all_of
 from calib.effects import Site
 from calib.problem.model import Source
 from calib.problem.places import standing
@@ -46,12 +47,12 @@ class Sways:
     @property
     def sentence(self) -> str:
         """What it says, and what to do about it."""
-        names = " and ".join(filter(None, [", ".join(self.names[:-1]), *self.names[-1:]]))
         return (
             f"rig.yaml says that the base stands still {self.said}, but from stop to stop it moves "
             f"by {1e3 * self.shift_m:.2f} mm and {1e3 * self.turn_rad:.2f} mrad rms, so that what "
-            f"it carries seems to scatter ({names}). Put 'moves: stop' under 'base' in rig.yaml; "
-            "with a place of the base for each stop, next to nothing of that scatter is left."
+            f"it carries seems to scatter ({all_of(self.names)}). Put 'moves: stop' under 'base' "
+            "in rig.yaml; with a place of the base for each stop, next to nothing of that scatter "
+            "is left."
         )
 
 

@@ -11,7 +11,7 @@ from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import hangs_on, words
+from calib.diagnosis.suggest import all_of, hangs_on, words
 from calib.diagnosis.verdict.matters import Weighed
 from calib.results.holdout import TAKEN_BACK, from_to
 
@@ -57,8 +57,7 @@ def sentences_of(
     out += [found.unsettled.unsettled] if found.unsettled and not found.sways else []
     out += [*heavy.refused, *traces]
     named = [c["add"] for c in candidates if c["step"] and not c["dressed_up"]]
-    every = " and ".join(filter(None, [", ".join(named[:-1]), *named[-1:]]))
-    beside = f"Beside {every}, there" if named else "There"
+    beside = f"Beside {all_of(named)}, there" if named else "There"
     structure = [
         f"{beside} is residual structure that no known effect explains.",
         *(line for each in formulas for line in _formula_sentences(each, residual)),
