@@ -133,13 +133,14 @@ def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpr
     """Chance from the scores alone; see the module.
 
     Args:
-        ways: shares (c, r) of the whitened score by stop, by surface, and by both.
+        ways: shares (c, r) of the whitened score by stop and, where stops share surfaces, by
+            surface, and by both.
         stops: how many stops have a share in it; one tells nothing.
         spent: how many unknowns of the model differ by stop alone.
     """
-    by_stop, by_place, both = (_evenly(shares) for shares in ways)
-    more = _beyond(by_place, both)
-    count = max(min(stops, len(ways[1])), 1)
+    by_stop, *others = (_evenly(shares) for shares in ways)
+    more = _beyond(*others) if others else np.zeros_like(by_stop)
+    count = max(min([stops, *(len(shares) for shares in ways[1:2])]), 1)
     nu = _freedom(ways[0], count)
     if np.trace(more) > 0.0:
         nu = min(nu, _freedom(ways[1], len(ways[1])))

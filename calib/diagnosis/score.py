@@ -76,17 +76,17 @@ class Scores:
         return self.cells[(self.stop >= 0) & (self.place >= 0), columns]
 
     def ways(self, columns: np.ndarray) -> list[np.ndarray]:
-        """Shares of some columns (n, q) by stop, by place, and by both, of those that have any
-        share of any; each adds up to the score, as rows that have no stop, or no place, are
-        clusters of their own."""
+        """Shares of some columns (n, q) by stop and, where any place is met from several stops, by
+        place, and by both, of those that have any share of any; each adds up to the score, as rows
+        that have no stop, or no place, are clusters of their own."""
         return [part[np.ix_(rows, columns)] for part, rows in self._ways]
 
     @cached_property
     def _ways(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Their shares (n, Q) by these ways, and which of them have any."""
-        by_stop = np.vstack([self.by_stop, self.cells[self.stop < 0]])
-        by_place = np.vstack([self.by_place, self.cells[self.place < 0]])
-        every = (by_stop, by_place, self.cells)
+        every = [np.vstack([self.by_stop, self.cells[self.stop < 0]])]
+        if np.bincount(self.place[self.place >= 0]).max(initial=0) > 1:
+            every += [np.vstack([self.by_place, self.cells[self.place < 0]]), self.cells]
         return [(part, np.flatnonzero(np.any(part, axis=1))) for part in every]
 
     @cached_property
