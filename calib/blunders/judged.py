@@ -16,11 +16,10 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import KNOWN, LEVELS, after_looks, at_least, enough, log_tail
+from calib.blunders.others import Others
 from calib.blunders.shifts import Shift, shifts
 from calib.blunders.uneven import Uneven, Whereabouts, unevenly
-from calib.linear.system import Linearisation
 from calib.problem.model import labels
-from calib.problem.problem import Problem
 from calib.residuals.groups import JOINTS, Group, kind_and_number
 
 ALPHA_BLUNDER = LEVELS["blunder"]
@@ -123,19 +122,20 @@ class LeftOut:
     aside: bool = False
 
 
-def judge(whole: Linearisation, problem: Problem, planned: Collection[str] = ()) -> list[Blunder]:
+def judge(others: Others, planned: Collection[str] = ()) -> list[Blunder]:
     """All groups of rows, those that chance explains least first.
 
     Args:
-        whole, problem: as of `shifts`.
+        others: as of `shifts`.
         planned: names of stops that nobody has measured yet, which tell nothing of how far out
             others of their kind are.
     """
+    problem = others.problem
     kinds: dict[tuple[str, str, bool], list[Shift]] = {}
     pairs = list(zip(problem.sources, labels(problem.sources), strict=True))
     gone = {group for source, _ in pairs for group in source.without}
     gone |= {Group("joints", *where, label) for source, label in pairs for where in source.unread}
-    for shift in shifts(whole, problem):
+    for shift in shifts(others):
         if shift.dof and shift.group not in gone:
             kinds.setdefault((*_alike(shift.group), shift.of_ranges), []).append(shift)
     # Of the level one half is for parts of the mesh, which are many, and one for all others.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -21,30 +23,62 @@ HELD_ALONE = 1e-6
 ROWS_TOGETHER = 400  # rows whose covariance is computed at once: bounds the memory
 
 
+class Held(NamedTuple):
+    """Rows of one place, as they are weighed, against all others.
+
+    Args:
+        rows: of each of its groups.
+        H: (m, m) their hat matrix, b: (m,) their right side at the optimum.
+    """
+
+    rows: Sequence[GroupRows]
+    H: np.ndarray
+    b: np.ndarray
+
+
+class Alike(NamedTuple):
+    """Rows of K places that make the same groups, and had they not lost any weight.
+
+    Args:
+        number: (K,) of each among all.
+        rows: (K,) the rows.
+        left: (K, m, m) their redundancy, or of sums the information that is left of a shift.
+        b: (K, m) their right side, or (K, m, P) columns in place of it.
+    """
+
+    number: Sequence[int]
+    rows: Sequence[GroupRows]
+    left: np.ndarray
+    b: np.ndarray
+
+
 @dataclass(frozen=True)
 class Others:
     """What all rows of a fit say, against which some of them are held.
 
     Args:
-        whole: they, linearised.
+        whole: they, linearised at its solution, with its scans.
+        problem: of that fit; candidates beside it change nothing.
         graph_rows: those of the kept unknowns that are not in it.
         kept: (S, S) covariance of the kept unknowns.
         step: (U,) one more step of all unknowns.
     """
 
     whole: Linearisation
+    problem: Problem
     graph_rows: GraphRows
     kept: np.ndarray
     step: np.ndarray
 
     @classmethod
-    def of(cls, whole: Linearisation) -> Others:
+    def of(cls, whole: Linearisation, problem: Problem) -> Others:
         """All rows at the solution of a fit."""
         layout = whole.layout
         graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)
         graph_rows = list(graph.linear_rows(whole.values))
         kept = _kept_covariance(whole, graph_rows)
-        return cls(whole, graph_rows, kept, step=_step(whole, graph_rows, kept))
+        step = _step(whole, graph_rows, kept)
+        return cls(whole, problem, graph_rows, kept=kept, step=step)
 
     def against(self, every: Sequence[GroupRows]) -> tuple[np.ndarray, np.ndarray]:
         """H and b of these rows."""
@@ -58,13 +92,38 @@ class Others:
             [Entries.of(rows.A, rows.columns) for rows in every], self.whole.layout.size
         )
 
-    def groups(self, problem: Problem) -> Iterator[list[Sequence[GroupRows]]]:
-        """All groups of rows, those of one place in a set; no more sets at once than memory should
-        hold."""
+    def every(self) -> Iterator[GroupRows]:
+        """The rows of all groups."""
+        return group_rows(self.whole, self.problem, self.graph_rows)
+
+    @cached_property
+    def held(self) -> Sequence[Held]:
+        """All groups of rows, those of one place together."""
         sets: dict[tuple[str, str], list[GroupRows]] = {}
-        for rows in group_rows(self.whole, problem, self.graph_rows):
+        for rows in self.every():
             sets.setdefault(rows.at, []).append(rows)
-        yield from _batches(sets.values())
+        found = []
+        for batch in _batches(sets.values()):
+            H, b = self.against([rows for some in batch for rows in some])
+            for some, mine in zip(batch, parts(batch), strict=True):
+                found.append(Held(some, H[mine, mine].copy(), b[mine].copy()))
+        return found
+
+    def alike(self, towards: np.ndarray | None = None) -> Iterator[Alike]:
+        """All groups of rows; with columns `towards` (U, P) of the covariance of all unknowns,
+        what the rows say along these in place of their right side."""
+        found: dict[object, list[tuple[int, GroupRows, np.ndarray, np.ndarray]]] = {}
+        number = 0
+        for some, H, b in self.held:
+            columns = b if towards is None else self.spread(some) @ towards
+            H, columns = at_their_sigmas(some, H, columns)
+            for rows, here in zip(some, parts([rows] for rows in some), strict=True):
+                left = rows.own_information - H[here, here]
+                found.setdefault(rows.like, []).append((number, rows, left, columns[here]))
+                number += 1
+        for each in found.values():
+            numbers, rows, left, columns = zip(*each, strict=True)
+            yield Alike(numbers, rows, left=np.stack(left), b=np.stack(columns))
 
 
 def parts(some: Iterable[Sequence[GroupRows]]) -> Iterator[slice]:
@@ -102,19 +161,21 @@ def at_their_sigmas(
     return H, b - H[:, g] @ (back[g] * b[g].T).T
 
 
-def whitening(M: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """What takes a score (r,) of information M (r, r) to independent ones (dof,) of unit variance,
-    in the directions that anything contradicts, in units of `size` (r,)."""
-    values, axes = contradicted(M / np.outer(size, size))
-    return axes / np.sqrt(values) / size[:, None]
+def whitening(M: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What takes scores (..., r) of informations M (..., r, r) to independent ones of unit variance
+    (..., r, r), in units of `size` (..., r): 0 along directions that nothing contradicts; and along
+    how many (...) something does."""
+    values, axes, seen = contradicted(M / (size[..., :, None] * size[..., None, :]))
+    over = np.sqrt(np.divide(1.0, values, out=np.zeros_like(values), where=seen))
+    return axes * over[..., None, :] / size[..., :, None], seen.sum(axis=-1)
 
 
-def contradicted(M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues (dof,) and eigenvectors (r, dof) of a redundancy (r, r), in the directions that
-    anything contradicts."""
-    values, axes = (M[0], np.eye(1)) if len(M) == 1 else np.linalg.eigh(M)
-    seen = values > HELD_ALONE
-    return values[seen], axes[:, seen]
+def contradicted(M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Eigenvalues (..., r) and eigenvectors (..., r, r) of redundancies (..., r, r), and along
+    which of these (..., r) anything contradicts."""
+    one = M.shape[-1] == 1
+    values, axes = (M[..., 0], np.ones_like(M)) if one else np.linalg.eigh(M)
+    return values, axes, values > HELD_ALONE
 
 
 def _kept_covariance(whole: Linearisation, graph_rows: GraphRows) -> np.ndarray:

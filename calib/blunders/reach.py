@@ -18,11 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.blunders.judged import Blunder
-from calib.blunders.others import Others, at_their_sigmas, parts, whitening
-from calib.blunders.rows import GroupRows
+from calib.blunders.others import Alike, Others, whitening
 from calib.linear.layout import positions
-from calib.linear.system import Linearisation
-from calib.problem.problem import Problem
 from calib.residuals.groups import CAD, Group
 
 PROMISED_SIGMAS = 3.0  # sigmas: what the diagnosis promises to name; see docs/one_thing_wrong.md
@@ -46,34 +43,32 @@ class FurthestMoved:
 
 
 def reaches(
-    whole: Linearisation,
-    problem: Problem,
-    blunders: Sequence[Blunder],
-    sigma: Mapping[str, float],
+    others: Others, blunders: Sequence[Blunder], sigma: Mapping[str, float]
 ) -> dict[Group, FurthestMoved]:
     """Group -> how far a mishap to it could move an estimate, unseen; of a scan, its
     place or its range zero, whichever is further.
 
     Args:
-        whole, problem: as of `judge`.
+        others: as of `judge`.
         blunders: what it gave.
         sigma: estimates that count, each with its sigma in its own unit.
     """
-    names, columns = _estimates(whole, problem, sigma)
-    others = Others.of(whole)
+    whole = others.whole
+    names, columns = _estimates(others, sigma)
+    if not names:
+        return {}
     enough = {(b.group, b.shift.of_ranges): b.enough for b in blunders}
     kept = positions(whole.layout.size, whole.layout.kept)[columns]
     towards = whole.followed(others.kept[:, kept])
     wide = np.array([sigma[name] for name in names])
     found: dict[Group, FurthestMoved] = {}
-    for sets in others.groups(problem) if names else ():
-        for group, of_ranges, moved in _moved(others, sets, towards):
-            if (group, of_ranges) not in enough:
-                continue
-            by = np.sqrt(enough[group, of_ranges]) * moved / wide
-            worst = int(np.argmax(by))
-            reach = FurthestMoved(names[worst], float(by[worst]))
-            found[group] = max(found.get(group, reach), reach, key=lambda r: r.sigmas)
+    for group, of_ranges, moved in (m for some in others.alike(towards) for m in _moved(some)):
+        if (group, of_ranges) not in enough:
+            continue
+        by = np.sqrt(enough[group, of_ranges]) * moved / wide
+        worst = int(np.argmax(by))
+        reach = FurthestMoved(names[worst], float(by[worst]))
+        found[group] = max(found.get(group, reach), reach, key=lambda r: r.sigmas)
     return found
 
 
@@ -94,13 +89,11 @@ def hardly_checked(found: Mapping[Group, FurthestMoved]) -> list[str]:
     ]
 
 
-def _estimates(
-    whole: Linearisation, problem: Problem, sigma: Mapping[str, float]
-) -> tuple[list[str], np.ndarray]:
+def _estimates(others: Others, sigma: Mapping[str, float]) -> tuple[list[str], np.ndarray]:
     """Names of the estimates that count, and their columns among all unknowns."""
-    names, columns = [], []
+    problem, layout, names, columns = others.problem, others.whole.layout, [], []
     for variable in problem.calibration:
-        at = whole.layout.at[variable]
+        at = layout.at[variable]
         for dof, column in zip(problem.variables[variable].dofs, np.r_[at], strict=True):
             if sigma.get(name := f"{variable}.{dof}", 0.0) > 0.0:
                 names.append(name)
@@ -108,26 +101,14 @@ def _estimates(
     return names, np.array(columns, int)
 
 
-def _moved(
-    others: Others, sets: Sequence[Sequence[GroupRows]], towards: np.ndarray
-) -> Iterator[tuple[Group, bool, np.ndarray]]:
+def _moved(some: Alike) -> Iterator[tuple[Group, bool, np.ndarray]]:
     """Groups, whether it is their range zero that is off, and by how much an offset of one squared
-    sigma in the test moves each estimate (P,) at most; `towards` (U, P) are these columns of C."""
-    every = [rows for some in sets for rows in some]
-    A = others.spread(every)
-    H, K = others.whole.covariance(A, others.kept), A @ towards
-    for some, mine in zip(sets, parts(sets), strict=True):
-        left, moved = at_their_sigmas(some, H[mine, mine], K[mine])
-        yield from _of_set(some, left, moved)
-
-
-def _of_set(
-    some: Sequence[GroupRows], H: np.ndarray, K: np.ndarray
-) -> Iterator[tuple[Group, bool, np.ndarray]]:
-    for rows, here in zip(some, parts([rows] for rows in some), strict=True):
-        raw = rows.own_information
-        for group, own in rows.groups.items():
-            checked = own.T @ (raw - H[here, here]) @ own
-            size = np.sqrt(np.maximum(np.diag(own.T @ raw @ own), 1e-300))
-            along = whitening(checked, size).T @ own.T @ K[here]
-            yield group, rows.of_ranges, np.linalg.norm(along, axis=0)
+    sigma in the test moves each estimate (P,) at most; `some` have these columns of C."""
+    raw = np.stack([rows.own_information for rows in some.rows])
+    for names in zip(*(rows.groups for rows in some.rows), strict=True):
+        own = some.rows[0].groups[names[0]]
+        size = np.sqrt(np.maximum(np.einsum("ir,kij,jr->kr", own, raw, own), 1e-300))
+        whiten, _ = whitening(own.T @ some.left @ own, size)
+        moved = np.linalg.norm(whiten.mT @ own.T @ some.b, axis=1)
+        for rows, group, each in zip(some.rows, names, moved, strict=True):
+            yield group, rows.of_ranges, each

@@ -33,6 +33,7 @@ from calib.rig import Rig
 from calib.solve.reweight import unweighted
 
 SCAN_SHIFT = (*TWIST_NAMES, ALONG_BEAMS)  # of a scan
+SCAN_UNITS = ("rad",) * 3 + ("m",) * 4
 SEVERAL_SCANS = 3  # scans, for most of them to say that the range zero of one is not theirs
 # Block (none for a prior), whitened derivative by each unknown, and right side: see `Graph`.
 GraphRows = Sequence[tuple[Block | None, Mapping[str, np.ndarray], np.ndarray]]
@@ -75,6 +76,13 @@ class GroupRows:
     def own_information(self) -> np.ndarray:
         """(m, m) what they say of an offset, all else being known."""
         return np.eye(len(self.A)) if self.information is None else self.information
+
+    @property
+    def like(self) -> tuple[object, ...]:
+        """What rows that make the same groups have in common."""
+        own = ((group.kind, each.shape, each.tobytes()) for group, each in self.groups.items())
+        turned, summed = self.turn is None, self.information is None
+        return (tuple(self.axes), tuple(self.units), turned, summed, *own)
 
     @property
     def at(self) -> tuple[str, str]:
@@ -254,19 +262,19 @@ def scan_rows(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """Every scan: through the place of its LiDAR, and through a range zero of its own."""
     for scan in problem.scans:
         sums = whole.scans[whole.layout.stops[key_of(scan)]]
-        count = len(sums.score)
-        for at in (np.arange(6), np.arange(6, count if len(problem.scans) >= SEVERAL_SCANS else 6)):
-            if len(at):
+        several = len(problem.scans) >= SEVERAL_SCANS
+        for at in (slice(6), slice(6, len(sums.score) if several else 6)):
+            if count := len(sums.score[at]):
                 yield GroupRows(
                     A=sums.cross[at],
                     columns=sums.columns,
                     b=sums.score[at],
-                    weight=np.ones(len(at)),
-                    sigma=np.ones(len(at)),
-                    axes=[SCAN_SHIFT[i] for i in at],
-                    units=["rad" if i < 3 else "m" for i in at],
-                    groups={scan.group: np.eye(len(at))},
-                    information=sums.information[np.ix_(at, at)],
+                    weight=np.ones(count),
+                    sigma=np.ones(count),
+                    axes=SCAN_SHIFT[at],
+                    units=SCAN_UNITS[at],
+                    groups={scan.group: np.eye(count)},
+                    information=sums.information[at, at],
                 )
 
 

@@ -23,10 +23,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.blunders.others import Others, at_their_sigmas, contradicted, parts, whitening
-from calib.blunders.rows import GroupRows, group_rows, scan_rows
-from calib.linear.system import Linearisation
-from calib.problem.problem import Problem
+from calib.blunders.others import Alike, Others, at_their_sigmas, contradicted, whitening
+from calib.blunders.rows import GroupRows, scan_rows
 from calib.problem.spread import Whose
 from calib.problem.unknowns import is_read
 from calib.residuals.groups import ALONG_BEAMS, Group
@@ -79,21 +77,20 @@ class Shift:
         return {unit: np.flatnonzero(units == unit) for unit in dict.fromkeys(self.units)}
 
 
-def shifts(whole: Linearisation, problem: Problem) -> Iterator[Shift]:
-    """Every group of rows against all others.
+def shifts(others: Others) -> list[Shift]:
+    """Every group of rows against all others."""
+    found: dict[int, list[Shift]] = {}
+    for some in others.alike():
+        summed = some.rows[0].information is not None
+        squares = [{}] * len(some.rows) if summed else list(_squares(some))
+        for groups in zip(*(rows.groups for rows in some.rows), strict=True):
+            every = (_of_sums if summed else _of_rows)(some, groups, squares)
+            for number, shift in zip(some.number, every, strict=True):
+                found.setdefault(number, []).append(shift)
+    return [shift for _, mine in sorted(found.items()) for shift in mine]
 
-    Args:
-        whole: all rows at the solution of a fit, with its scans.
-        problem: of that fit; candidates beside it change nothing.
-    """
-    others = Others.of(whole)
-    for sets in others.groups(problem):
-        yield from _against(others, sets)
 
-
-def standing_alone(
-    whole: Linearisation, problem: Problem, some: Sequence[tuple[Shift, float]]
-) -> list[Group]:
+def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[Group]:
     """Of groups at different places that stand out, those that still do once those before them are
     left out: what one of them does to the estimate makes others stand out.
 
@@ -101,15 +98,14 @@ def standing_alone(
     that of one beside others is their Schur complement.
 
     Args:
-        whole, problem: as of `shifts`.
+        others: as of `shifts`.
         some: shifts of these, and the limit of the statistic beyond which each stands out; the
             worst first.
     """
-    others = Others.of(whole)
     wanted = {(shift.group, shift.of_ranges) for shift, _ in some}
     mine = {
         key: rows
-        for rows in group_rows(whole, problem, others.graph_rows)
+        for rows in others.every()
         for group in rows.groups
         if (key := (group, rows.of_ranges)) in wanted
     }
@@ -128,41 +124,32 @@ def standing_alone(
     return alone
 
 
-def beside_bodies(
-    whole: Linearisation,
-    problem: Problem,
-    whose: Collection[Whose],
-    wild: Collection[Group],
-) -> Sums:
+def beside_bodies(others: Others, whose: Collection[Whose], wild: Collection[Group]) -> Sums:
     """What rows that are of no body say of their sigmas; arguments as of
     `components.squares_beside_bodies`."""
-    others = Others.of(whole)
+    whole = others.whole
     return squares_beside_bodies(
-        problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
+        others.problem, whole.values, whole, others.kept, whose, others.graph_rows, wild
     )
 
 
-def told_by_stop(
-    whole: Linearisation, problem: Problem, whose: Mapping[Whose, int], wild: Collection[Group]
-) -> ToldApart:
+def told_by_stop(others: Others, whose: Mapping[Whose, int], wild: Collection[Group]) -> ToldApart:
     """What rows of bodies and of joints say of their errors beyond their sigmas, all of a stop
     together and at their full weights, in these sigmas.
 
     Args:
-        whole, problem: as of `shifts`.
+        others: as of `shifts`.
         whose: rows that are asked -> the group that they are of.
         wild: blunders; stops that have one are not asked.
     """
-    others, found = Others.of(whole), []
-    for sets in others.groups(problem):
-        H, b = others.against([rows for some in sets for rows in some])
-        for some, mine in zip(sets, parts(sets), strict=True):
-            group = np.array([whose.get(each, -1) for rows in some for each in _whose(rows)])
-            at = np.flatnonzero(group >= 0)
-            if len(at) and not any(set(wild).intersection(rows.groups) for rows in some):
-                left, score = at_their_sigmas(some, H[mine, mine], b[mine])
-                left = block_diag(*(rows.own_information for rows in some)) - left
-                found.append(Told(score[at], left[np.ix_(at, at)], group[at]))
+    found = []
+    for some, H, b in others.held:
+        group = np.array([whose.get(each, -1) for rows in some for each in _whose(rows)])
+        at = np.flatnonzero(group >= 0)
+        if len(at) and not any(set(wild).intersection(rows.groups) for rows in some):
+            H, score = at_their_sigmas(some, H, b)
+            left = block_diag(*(rows.own_information for rows in some)) - H
+            found.append(Told(score[at], left[np.ix_(at, at)], group[at]))
     return ToldApart.at_stops(found)
 
 
@@ -179,22 +166,23 @@ def _whose(rows: GroupRows) -> list[Whose | None]:
     return [Whose("joints", axis, unit) if there else None for axis, unit, there in each]
 
 
-def of_poses(whole: Linearisation, problem: Problem, wild: Collection[Group]) -> Told | None:
+def of_poses(others: Others, wild: Collection[Group]) -> Told | None:
     """What all rows say of twists (6 K) of the LiDAR at stops, those of a kind in one group: 0 of
     shifts, 1 of turns. Of the `wild` scans, nothing; None where there is no other. Where there are
     many stops, K of them, drawn evenly, stand for all."""
     every = [
         rows
-        for rows in scan_rows(whole, problem)
+        for rows in scan_rows(others.whole, others.problem)
         if not rows.of_ranges and not set(wild) & set(rows.groups)
     ]
     if not every:
         return None
     every = [every[i] for i in drawn_evenly(len(every), TELLING_SCANS, seed=0)]
-    H, b = Others.of(whole).against(every)
+    H, b = others.against(every)
     raw = block_diag(*(rows.information for rows in every))
     size = np.sqrt(np.maximum(np.diag(raw), 1e-300))
-    values, axes = contradicted((raw - H) / np.outer(size, size))
+    values, axes, seen = contradicted((raw - H) / np.outer(size, size))
+    values, axes = values[seen], axes[:, seen]
     told, along = size[:, None] * axes * values, size[:, None] * axes
     return Told(
         score=along @ (axes.T @ (b / size)),
@@ -208,85 +196,74 @@ def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
     if not len(at):
         return 0.0
     size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
-    return float(np.sum(np.square(whitening(M[np.ix_(at, at)], size).T @ u[at])))
+    whiten, _ = whitening(M[np.ix_(at, at)], size)
+    return float(np.sum(np.square(whiten.T @ u[at])))
 
 
-def _against(others: Others, sets: Sequence[Sequence[GroupRows]]) -> Iterator[Shift]:
-    """Groups against all other rows."""
-    H, b = others.against([rows for some in sets for rows in some])
-    for some, mine in zip(sets, parts(sets), strict=True):
-        yield from _of_set(some, *at_their_sigmas(some, H[mine, mine], b[mine]))
-
-
-def _of_set(some: Sequence[GroupRows], H: np.ndarray, b: np.ndarray) -> Iterator[Shift]:
-    for rows, here in zip(some, parts([rows] for rows in some), strict=True):
-        left, squares = rows.own_information - H[here, here], {}
-        of = _of_sums
-        if rows.information is None:
-            of, squares = _of_rows, _squares(rows, b[here], np.diag(left))
-        for group, own in rows.groups.items():
-            yield of(group, own, rows, b[here], left, squares)
-
-
-def _of_sums(
-    group: Group,
-    own: np.ndarray,
-    rows: GroupRows,
-    score: np.ndarray,
-    left: np.ndarray,
-    squares: Squares,
-) -> Shift:
-    """The score test of a shift that some rows of the stop alone have."""
-    left, score = own.T @ left @ own, own.T @ score
-    size = np.sqrt(np.maximum(np.diag(own.T @ rows.information @ own), 1e-300))
+def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -> Iterator[Shift]:
+    """The score tests of shifts that some rows of each stop alone have."""
+    first = some.rows[0]
+    own = first.groups[groups[0]]
+    raw = np.stack([rows.information for rows in some.rows])
+    left, score = own.T @ some.left @ own, some.b @ own
+    size = np.sqrt(np.maximum(np.einsum("ir,kij,jr->kr", own, raw, own), 1e-300))
+    whiten, dof = whitening(left, size)
+    score = np.vecmat(score, whiten)
+    offset, covariance = np.matvec(whiten, score), whiten @ whiten.mT
+    held = dof < left.shape[1]
+    left[held] = 0.0
     at = np.argmax(own, axis=0)
-    whiten = whitening(left, size)
-    score = whiten.T @ score
-    return Shift(
-        group=group,
-        statistic=float(score @ score),
-        dof=len(score),
-        offset=whiten @ score,
-        covariance=whiten @ whiten.T,
-        information=left if len(score) == len(left) else np.zeros_like(left),
-        axes=[rows.axes[i] for i in at],
-        units=[rows.units[i] for i in at],
-        squares=squares,
-    )
+    for k, group in enumerate(groups):
+        yield Shift(
+            group=group,
+            statistic=float(score[k] @ score[k]),
+            dof=int(dof[k]),
+            offset=offset[k],
+            covariance=covariance[k],
+            information=left[k],
+            axes=[first.axes[i] for i in at],
+            units=[first.units[i] for i in at],
+            squares=squares[k],
+        )
 
 
-def _of_rows(
-    group: Group,
-    own: np.ndarray,
-    rows: GroupRows,
-    b: np.ndarray,
-    left: np.ndarray,
-    squares: Squares,
-) -> Shift:
-    """The residual of a group under the fit without it; see the module."""
-    values, axes = contradicted(own.T @ left @ own)
+def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -> Iterator[Shift]:
+    """The residuals of groups under the fit without each; see the module."""
+    first = some.rows[0]
+    own = first.groups[groups[0]]
+    values, axes, seen = contradicted(own.T @ some.left @ own)
+    values = np.where(seen, values, 0.0)
+    over = np.divide(1.0, values, out=np.zeros_like(values), where=seen)
     basis = own @ axes
-    along = (basis.T @ b) / values
+    along = np.vecmat(some.b, basis) * over
     at = np.flatnonzero(np.any(own != 0, axis=1))
-    turned = (basis if rows.turn is None else rows.turn @ basis)[at]
-    out, told = rows.sigma[at][:, None] * turned, turned / rows.sigma[at][:, None]
-    return Shift(
-        group=group,
-        statistic=float(along @ (values * along)),
-        dof=len(values),
-        offset=-out @ along,
-        covariance=(out / values) @ out.T,
-        information=(told * values) @ told.T,
-        axes=[rows.axes[i] for i in at],
-        units=[rows.units[i] for i in at],
-        squares=squares,
-    )
+    turned = basis if first.turn is None else np.stack([r.turn for r in some.rows]) @ basis
+    sigma = np.stack([rows.sigma[at] for rows in some.rows])[:, :, None]
+    out, told = sigma * turned[:, at], turned[:, at] / sigma
+    statistic = np.sum(values * np.square(along), axis=1)
+    offset, covariance = -np.matvec(out, along), (out * over[:, None]) @ out.mT
+    information = (told * values[:, None]) @ told.mT
+    for k, group in enumerate(groups):
+        yield Shift(
+            group=group,
+            statistic=float(statistic[k]),
+            dof=int(seen[k].sum()),
+            offset=offset[k],
+            covariance=covariance[k],
+            information=information[k],
+            axes=[first.axes[i] for i in at],
+            units=[first.units[i] for i in at],
+            squares=squares[k],
+        )
 
 
-def _squares(rows: GroupRows, b: np.ndarray, left: np.ndarray) -> Squares:
-    """Unit -> sum of squares (m,) of rows of it, and of their redundancies `left`."""
-    units = np.array(rows.units)
-    return {
-        unit: (float(np.square(b[units == unit]).sum()), float(left[units == unit].sum()))
-        for unit in dict.fromkeys(rows.units)
+def _squares(some: Alike) -> Iterator[Squares]:
+    """Of each place unit -> sum of squares of rows of it, and of their redundancies."""
+    units, left = np.array(some.rows[0].units), np.einsum("kii->ki", some.left)
+    each = {
+        unit: (np.square(some.b[:, at]).sum(axis=1), left[:, at].sum(axis=1))
+        for unit in dict.fromkeys(some.rows[0].units)
+        if len(at := np.flatnonzero(units == unit))
     }
+    for k in range(len(some.rows)):
+        yield {unit: (float(b[k]), float(of[k])) for unit, (b, of) in each.items()}

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
+from calib.blunders.others import Others
 from calib.diagnosis.candidates import covariates, finer, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.judges import Shares
@@ -20,7 +21,6 @@ from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.linear.layout import Layout
-from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
@@ -234,23 +234,23 @@ class Look:
         return replace(self, linear=thin, named=named, unnamed=unnamed, noise=noise)
 
     @cached_property
-    def fitted(self) -> Linearisation:
+    def others(self) -> Others:
         """The rows, linearised, over the unknowns of the fit alone."""
-        return self.linear.whole.onto(Layout.of(self.stand.estimate.problem))
+        problem = self.stand.estimate.problem
+        return Others.of(self.linear.whole.onto(Layout.of(problem)), problem)
 
     @cached_property
     def blunders(self) -> list[Blunder]:
         """All groups of rows, those that chance explains least first."""
-        return judge(self.fitted, self.stand.estimate.problem)
+        return judge(self.others)
 
     @cached_property
     def chance(self) -> list[Chance]:
         """What may scatter by chance, that which chance explains least first."""
-        problem = self.stand.estimate.problem
         wider = [e for e in self.by_rows if e.widens]
         posed = [e for e in self.by_rows if not e.widens]
-        of_rows = rows_by_chance(wider, self.blunders, self.fitted, problem)
-        of_poses = of_lidar(posed, self.blunders, self.fitted, problem)
+        of_rows = rows_by_chance(wider, self.blunders, self.others)
+        of_poses = of_lidar(posed, self.blunders, self.others)
         return ranked([*self.values, *of_poses, *of_rows])
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.judged import Blunder, judge
+from calib.blunders.others import Others
 from calib.blunders.reach import FurthestMoved, reaches
 from calib.diagnosis.candidates import known_effects
 from calib.diagnosis.linear import WIDENED
@@ -149,10 +150,10 @@ def _blunders(
     sigma: Mapping[Key, float],
 ) -> tuple[list[Blunder], dict[Group, FurthestMoved]]:
     """All groups of rows, and how far a mishap to each that is not found moves an estimate."""
-    whole, problem = _linear(scene, poses)
-    blunders = judge(whole, problem, planned)
+    others = Others.of(*_linear(scene, poses))
+    blunders = judge(others, planned)
     known = {key.name: size for key, size in sigma.items()}
-    return blunders, reaches(whole, problem, blunders, known)
+    return blunders, reaches(others, blunders, known)
 
 
 def _linear(scene: PlanningScene, poses: Poses | None) -> tuple[Linearisation, Problem]:

@@ -359,7 +359,7 @@ def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:
     """How far mishaps that are not found could move what a run reports."""
     sigma = np.sqrt(np.diag(run.solution.covariance)).tolist()
     known = dict(zip(run.solution.names, sigma, strict=True))
-    return reaches(look.fitted, look.stand.estimate.problem, look.blunders, known)
+    return reaches(look.others, look.blunders, known)
 
 
 def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:

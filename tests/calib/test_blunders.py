@@ -1,12 +1,14 @@
 """Every group of rows against all others: by dense algebra, by leaving it out, and by chance."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from calib.blunders import judged, told
+from calib.blunders.others import Others
 from calib.blunders.shifts import Shift, of_poses, shifts, standing_alone
 from calib.effects import find
 from calib.linear.clusters import Gradients
@@ -37,7 +39,7 @@ def both(request, tmp_path_factory):
 def found(case):
     """Group -> its shift, as the program has it."""
     linear = case.linear(gradients=Gradients(len(case.dense.sigma)))
-    every = shifts(linear, case.start.problem)
+    every = shifts(Others.of(linear, case.start.problem))
     return {shift.group: shift for shift in every if not shift.of_ranges}
 
 
@@ -85,7 +87,7 @@ def with_range_zero(tmp_path):
 
 def test_a_range_zero_of_one_scan_is_off_as_dense_rows_say(tmp_path):
     case, linear = with_range_zero(tmp_path)
-    here = {s.group: s for s in shifts(linear, case.start.problem) if s.of_ranges}
+    here = {s.group: s for s in shifts(Others.of(linear, case.start.problem)) if s.of_ranges}
     there = Groups(case.dense)
     assert here.keys() == there.scans.keys()
     for group, shift in here.items():
@@ -101,7 +103,8 @@ def test_groups_are_told_apart_by_what_each_adds_to_those_before_it(tmp_path):
     not where it is a little above; what is not accepted is not left out for the next."""
     case, linear = with_range_zero(tmp_path)
     problem, there = case.start.problem, Groups(case.dense)
-    every = {(s.group, s.of_ranges): s for s in shifts(linear, problem)}
+    others = Others.of(linear, problem)
+    every = {(s.group, s.of_ranges): s for s in shifts(others)}
     bodies = [
         Group("body", stop, body)
         for stop, body in (("s0", "base_markers"), ("s2", "mount_markers"))
@@ -115,14 +118,14 @@ def test_groups_are_told_apart_by_what_each_adds_to_those_before_it(tmp_path):
         adds = there.together([*before, mine]) - there.together(before)
         known = [(every[key], -1.0) for key in order[: len(before)]]
         for limit, accepted in ((adds - 1e-5, True), (adds + 1e-5, False)):
-            found = standing_alone(linear, problem, [*known, (every[group, zero], limit)])
+            found = standing_alone(others, [*known, (every[group, zero], limit)])
             assert (len(found) == len(known) + 1) is accepted, str(group)
         before.append(mine)
     worst, second, third = (every[key] for key in order[:3])
     known = [(worst, -1.0), (second, np.inf)]
     adds = there.together([columns[0], columns[2]]) - there.together([columns[0]])
     for limit, count in ((adds - 1e-5, 2), (adds + 1e-5, 1)):
-        assert len(standing_alone(linear, problem, [*known, (third, limit)])) == count
+        assert len(standing_alone(others, [*known, (third, limit)])) == count
 
 
 @pytest.mark.parametrize("lidar", [True, False], ids=["lidar", "tracker alone"])
@@ -241,8 +244,9 @@ class Drawn:
     def judged(self, statistics, monkeypatch):
         """The verdict on groups that are so far off, the others being as they are."""
         off = [replace(s, statistic=statistics.get(g, s.statistic)) for g, s in self.shifts.items()]
-        monkeypatch.setattr(judged, "shifts", lambda whole, problem: iter(off))
-        return {b.group: b for b in judged.judge(None, self.case.start.problem)}
+        monkeypatch.setattr(judged, "shifts", lambda others: iter(off))
+        others = SimpleNamespace(problem=self.case.start.problem)
+        return {b.group: b for b in judged.judge(others)}
 
 
 @pytest.fixture(scope="module")
@@ -349,9 +353,10 @@ def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monke
 @pytest.mark.parametrize("most", [1, 2, 3])
 def test_of_many_scans_some_drawn_evenly_tell_what_they_tell_among_all(tmp_path, monkeypatch, most):
     case, linear = with_range_zero(tmp_path)
-    every = of_poses(linear, case.start.problem, [])
+    others = Others.of(linear, case.start.problem)
+    every = of_poses(others, [])
     monkeypatch.setattr("calib.blunders.shifts.TELLING_SCANS", most)
-    some = of_poses(linear, case.start.problem, [])
+    some = of_poses(others, [])
     scans = len(case.start.problem.scans)
     assert scans == 4
     chosen = drawn_evenly(scans, most, seed=0)

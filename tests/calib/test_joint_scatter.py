@@ -98,7 +98,7 @@ def test_readings_that_are_left_out_tell_nothing(tmp_path, left_out):
     stand = stand_of(run, quiet)
     problem, look = stand.estimate.problem, stand.look(quiet)
     whose = {each: j for j, each in enumerate(w for w in sigmas(problem) if w.kind == "joints")}
-    told = told_by_stop(look.fitted, problem, whose, [])
+    told = told_by_stop(look.others, whose, [])
     j5 = whose[Whose("joints", "j5", "rad")]
     told_of = sum(part.score[..., part.group == j5].size for part in told.parts)
     assert told_of == 60 - len(tokens)

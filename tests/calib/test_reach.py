@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib.blunders.judged import judge
+from calib.blunders.others import Others
 from calib.blunders.reach import PROMISED_SIGMAS, FurthestMoved, hardly_checked, reaches
 from calib.linear.clusters import Gradients
 from calib.residuals.groups import CAD, Group
@@ -38,10 +39,11 @@ def test_no_unseen_mishap_moves_an_estimate_further_and_one_goes_so_far(both):
     names, by_rows = estimates(Groups(case.dense))
     sigma = np.linalg.norm(by_rows, axis=1)
     dense = {*places[CAD].parts, *places[CAD].scans}
-    every = [b for b in judge(linear, problem) if not b.shift.of_ranges]
+    others = Others.of(linear, problem)
+    every = [b for b in judge(others) if not b.shift.of_ranges]
     blunders = [b for b in every if b.group in dense]  # of exact encoders there are no dense rows
     rng, same = np.random.default_rng(3), 0
-    found = reaches(linear, problem, every, dict(zip(names, sigma.tolist(), strict=True)))
+    found = reaches(others, every, dict(zip(names, sigma.tolist(), strict=True)))
     for each in blunders:
         there = places[each.group.where]
         D = there.directions(each.group)

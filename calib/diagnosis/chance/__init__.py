@@ -20,11 +20,11 @@ from scipy import special
 
 from calib.blunders.chance import LEVELS, POWER, after_looks, at_least
 from calib.blunders.judged import Blunder
+from calib.blunders.others import Others
 from calib.blunders.shifts import beside_bodies, of_poses, told_by_stop
 from calib.diagnosis.chance.at_zero import AtZero
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
-from calib.linear.system import Linearisation
 from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
 from calib.residuals.groups import Group
@@ -219,13 +219,11 @@ def chances(
     return [chance for chance in found if chance is not None]
 
 
-def of_lidar(
-    some: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
-) -> list[Chance]:
+def of_lidar(some: Sequence[Scatter], blunders: Sequence[Blunder], others: Others) -> list[Chance]:
     """The same of effects on where the LiDAR is at each stop, scans that are blunders left out;
     arguments as of `rows_by_chance`."""
     wild = [blunder.group for blunder in blunders if blunder.found]
-    rows = of_poses(whole, problem, wild) if some else None
+    rows = of_poses(others, wild) if some else None
     found = [_of_values(effect, rows) for effect in some if rows is not None]
     return [chance for chance in found if chance is not None]
 
@@ -270,7 +268,7 @@ def ranked(some: Sequence[Chance]) -> list[Chance]:
 
 
 def rows_by_chance(
-    effects: Sequence[Scatter], blunders: Sequence[Blunder], whole: Linearisation, problem: Problem
+    effects: Sequence[Scatter], blunders: Sequence[Blunder], others: Others
 ) -> list[Chance]:
     """The tests that rows scatter beyond their sigmas, those of blunders left out; of those that
     next to nothing checks there is none.
@@ -278,9 +276,9 @@ def rows_by_chance(
     Args:
         effects: that say so.
         blunders: all groups of rows.
-        whole: all rows, linearised at the fit.
-        problem: of the fit.
+        others: all rows of the fit.
     """
+    problem = others.problem
     seen: dict[Whose, list[tuple[float, float]]] = {}
     for shift in (b.shift for b in blunders if not b.found and b.group.kind == "body"):
         for unit, squares_there in shift.squares.items():
@@ -289,24 +287,22 @@ def rows_by_chance(
     sites = {effect.site for effect in effects} - {Site.TRACKER}
     wild = [b.group for b in blunders if b.found]
     if whose := {each for site in sites for each in rows_at(problem, site)}:
-        sums |= beside_bodies(whole, problem, whose, wild)
+        sums |= beside_bodies(others, whose, wild)
     tests = (_of_rows(effect, sums, problem) for effect in effects)
     found = [chance for chance in tests if chance is not None]
-    return _by_likelihood(found, whole, problem, wild)
+    return _by_likelihood(found, others, wild)
 
 
-def _by_likelihood(
-    found: list[Chance], whole: Linearisation, problem: Problem, wild: Sequence[Group]
-) -> list[Chance]:
+def _by_likelihood(found: list[Chance], others: Others, wild: Sequence[Group]) -> list[Chance]:
     """The same, where scatter of a tracker and of joints, if both are found, are in the order of
     their likelihoods over all rows of each stop: rows of one kind show what those of the other err
     by, and a fit that lacks either has given them less weight."""
     both = [chance for chance in found if chance.found and chance.effect.site in TAKING_IN]
     if len(both) < 2:
         return found
-    mine = [rows_at(problem, chance.effect.site) for chance in both]
+    mine = [rows_at(others.problem, chance.effect.site) for chance in both]
     number = {whose: i for i, whose in enumerate(chain(*mine))}
-    told = told_by_stop(whole, problem, number, wild)
+    told = told_by_stop(others, number, wild)
     ratio = []
     for some in mine if told.parts else ():
         of_it = told.of(*(number[whose] for whose in some))

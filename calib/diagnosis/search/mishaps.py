@@ -126,7 +126,7 @@ def _wild(look: Look) -> list[Blunder]:
     if len(worst) < 2:
         return worst
     some = [(b.shift, b.limit) for b in sorted(worst, key=lambda b: -b.evidence)]
-    alone = standing_alone(look.fitted, look.stand.estimate.problem, some)
+    alone = standing_alone(look.others, some)
     return [b for b in worst if b.group in alone]
 
 
