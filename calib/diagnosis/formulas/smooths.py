@@ -234,6 +234,7 @@ def _tested(
 def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:
     # Every set has the same clusters in the same order, so the same draw of signs is one world.
     shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
+    shares = shares.astype(signs.dtype)
     return by_rank(np.sum(np.square(signs @ shares), axis=1))
 
 

@@ -137,11 +137,10 @@ class BeamTable:
     @cached_property
     def signs(self) -> np.ndarray:
         """(R, C) what the clusters' shares of a score are multiplied by to make one of chance; see
-        `Scores.draws`."""
+        `Scores.draws`. In single precision, which is enough for it."""
         stop, place, _ = self.cells
-        return np.random.default_rng(0).standard_normal(
-            (FORMULA_DRAWS, stop.max() + place.max() + 2)
-        )
+        shape = FORMULA_DRAWS, stop.max() + place.max() + 2
+        return np.random.default_rng(0).standard_normal(shape).astype(np.float32)
 
     @cached_property
     def of_others(self) -> tuple[Matrix, np.ndarray]:

@@ -39,10 +39,11 @@ class Checks:
 
     @classmethod
     def of(cls, residual: np.ndarray, redundancy: np.ndarray) -> Checks:
-        """Of residuals (m,) whose covariance is the redundancy (m, m), where sigmas are right."""
+        """Of residuals (..., m) whose covariance is the redundancy (..., m, m), where sigmas are
+        right."""
         values, axes = np.linalg.eigh(redundancy)
         seen = values > UNSEEN_REDUNDANCY  # in the others nothing checks the rows: residuals are 0
-        square = np.square(axes[:, seen].T @ residual)
+        square = np.square(np.vecmat(residual, axes))[seen]
         return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))
 
     @classmethod

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from calib.solve.components.checks import Checks
 from calib.solve.components.told import Told, ToldApart
 
 READINGS_TOGETHER = 120  # whose covariance is computed at once: of 17 stops of seven joints
+# Stops, from which each tells its own alone. What they tell of each other goes as one over their
+# number: with 300 poses of an iiwa, spreads change by less than 0.01 of theirs, and with 60 by up
+# to 0.1.
+MANY_STOPS = 200
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,8 @@ class Readings:
         count = max(1, READINGS_TOGETHER // len(whose))
         parts = [pairs[i : i + count] for i in range(0, len(pairs), count)]
         sigma, beyond = np.array([sigmas[each] for each in whose]).T
-        told = ToldApart([_part(part, values, linear, kept) for part in parts])
+        found = [_part(part, values, linear, kept, len(pairs) > MANY_STOPS) for part in parts]
+        told = ToldApart.at_stops([each for part in found for each in part])
         return cls(whose, told, np.sqrt(sigma**2 - beyond**2) / sigma)
 
     @cached_property
@@ -91,7 +97,8 @@ class Readings:
             every.append(Checks.of(residual, redundancy))
             for j, found in enumerate(each):
                 if len(mine := np.flatnonzero(part.group == j)):
-                    found.append(Checks.of(residual[mine], redundancy[np.ix_(mine, mine)]))
+                    alone = redundancy[..., mine[:, None], mine]
+                    found.append(Checks.of(residual[..., mine], alone))
         return Checks.together(every), [Checks.together(found) for found in each]
 
 
@@ -107,10 +114,11 @@ def _part(
     values: Values,
     linear: Linearisation,
     kept: np.ndarray,
-) -> Told:
-    """Of readings at some stops: what is misreported there, and which joint (dim,) each is of.
-    Those that the fit gave less weight count as all others: what all else says of them is the
-    same."""
+    apart: bool,
+) -> list[Told]:
+    """Of readings at some stops: what is misreported there, and which joint (dim,) each is of; of
+    each stop `apart`, or of all together. Those that the fit gave less weight count as all others:
+    what all else says of them is the same."""
     pairs = [(u, np.flatnonzero(number >= 0)) for u, number in numbered]
     sigma = np.concatenate([u.sigma[at] for u, at in pairs])
     scaled = np.concatenate([values[u.name][at] for u, at in pairs]) / sigma
@@ -118,7 +126,11 @@ def _part(
     rows = over_all([Entries.one_each(1.0 / sigma, columns)], linear.layout.size)
     of_each = np.concatenate([number[number >= 0] for _, number in numbered])
     variance = np.concatenate([np.full(len(at), 1.0 / u.weight) for u, at in pairs])
-    return Told.fitted(scaled, linear.covariance(rows, kept), variance, of_each)
+    covariance, ends = linear.covariance(rows, kept), [len(sigma)]
+    if apart:
+        ends = np.cumsum([len(at) for _, at in pairs]).tolist()
+    some = [slice(*each) for each in pairwise([0, *ends])]
+    return [Told.fitted(scaled[s], covariance[s, s], variance[s], of_each[s]) for s in some]
 
 
 @dataclass(frozen=True)
