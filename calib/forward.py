@@ -72,6 +72,47 @@ class Placed:
         return np.concatenate([np.broadcast_to(d, (count, *d.shape[1:])) for d in some], axis=2)
 
 
+class RowsOf(Mapping[str, np.ndarray]):
+    """Bases at some of the stops that they were computed for: rows are taken when asked.
+
+    Args:
+        whole: variable -> (K, ...) basis, or (1, ...) where it is the same at all stops.
+        index: (k,) which of the stops.
+    """
+
+    def __init__(self, whole: Mapping[str, np.ndarray], index: np.ndarray) -> None:
+        self.whole, self.index = whole, index
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        basis = self.whole[name]
+        return basis if len(basis) == 1 else basis[self.index]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.whole)
+
+    def __len__(self) -> int:
+        return len(self.whole)
+
+    def __reduce__(self) -> tuple[type, tuple[dict[str, np.ndarray]]]:
+        return dict, (dict(self),)  # what is sent elsewhere is these rows alone
+
+
+def stacked(
+    bases: Sequence[Mapping[str, np.ndarray]], counts: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """The bases of sets of stops, so many in each, as those of all of them."""
+    first = bases[0]
+    if isinstance(first, RowsOf) and all(
+        isinstance(each, RowsOf) and each.whole is first.whole for each in bases
+    ):
+        return dict(RowsOf(first.whole, np.concatenate([each.index for each in bases])))
+    each = {
+        n: [np.broadcast_to(b[n], (k, *b[n].shape[1:])) for b, k in zip(bases, counts, strict=True)]
+        for n in first
+    }
+    return {n: np.concatenate(parts) for n, parts in each.items()}
+
+
 @dataclass(frozen=True)
 class Stops:
     """The geometry of K stops that share every variable.
@@ -83,7 +124,7 @@ class Stops:
         joint_bases: variable -> (K or 1, J, P), the joint error per unit.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
-        noise: variable of the joint errors of these stops alone, one of `joint_bases`, or None.
+        noise: variable of the joint errors (J,) of these stops alone, or None.
     """
 
     rig: Rig
@@ -96,14 +137,12 @@ class Stops:
 
     def with_joint_noise(self, variable: str) -> Stops:
         """The same stops, with what their encoders misreport as one more unknown."""
-        noise = np.eye(self.joints.shape[1])[None]
-        bases = {**self.joint_bases, variable: noise}
-        return replace(self, joint_bases=bases, noise=variable)
+        return replace(self, noise=variable)
 
     @property
     def variables(self) -> tuple[str, ...]:
         """What places the rig in the world."""
-        return (self.root, *self.edge_bases, *self.joint_bases)
+        return (self.root, *self.edge_bases, *self.joint_bases, *self.own[1:])
 
     @property
     def own(self) -> tuple[str, ...]:
@@ -112,48 +151,35 @@ class Stops:
 
     def some(self, index: np.ndarray, root: str) -> Stops:
         """Those of the stops, with their root."""
-
-        beside = (np.diff(index) == 1).all()
-        chosen = slice(index[0], index[-1] + 1) if beside else index  # a view: no copy
-
-        def of(bases: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-            return {n: basis if len(basis) == 1 else basis[chosen] for n, basis in bases.items()}
-
-        bases = {"edge_bases": of(self.edge_bases), "joint_bases": of(self.joint_bases)}
-        return replace(self, joints=self.joints[index], root=root, **bases)
+        return replace(
+            self,
+            joints=self.joints[index],
+            edge_bases=RowsOf(self.edge_bases, index),
+            joint_bases=RowsOf(self.joint_bases, index),
+            root=root,
+        )
 
     @classmethod
     def together(cls, stops: Sequence[Stops]) -> Stops:
         """Stops that share all but their own unknowns, as one. Its own are called `ROOT` and
         `NOISE`, with values (K, 4, 4) and (K, J): one for each stop."""
-        first = stops[0]
-
-        def stacked(bases: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-            shared = [name for name in bases[0] if name != first.noise]
-            counts = [len(s.joints) for s in stops]
-            each = {
-                n: [
-                    b[n] if len(b[n]) == k else np.repeat(b[n], k, axis=0)
-                    for b, k in zip(bases, counts, strict=True)
-                ]
-                for n in shared
-            }
-            return {n: np.concatenate(parts) for n, parts in each.items()}
-
-        out = cls(
+        first, counts = stops[0], [len(s.joints) for s in stops]
+        return cls(
             first.rig,
             np.concatenate([s.joints for s in stops]),
-            stacked([s.edge_bases for s in stops]),
-            stacked([s.joint_bases for s in stops]),
+            stacked([s.edge_bases for s in stops], counts),
+            stacked([s.joint_bases for s in stops], counts),
             root=ROOT,
             reference=first.reference,
+            noise=None if first.noise is None else NOISE,
         )
-        return out if first.noise is None else out.with_joint_noise(NOISE)
 
     def in_root(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_root_frame under all effects of edges and joints; here and below, without
         `derivatives` there are none."""
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
+        if self.noise is not None:
+            joints = joints + values[self.noise]
         for name, basis in self.joint_bases.items():
             joints = joints + np.matvec(basis, values[name])
         for name, basis in self.edge_bases.items():
@@ -166,6 +192,8 @@ class Stops:
         d = {n: by_twist @ _flat(basis) for n, basis in self.edge_bases.items()}
         for name, basis in self.joint_bases.items():
             d[name] = d.get(name, 0.0) + placed.d_joint @ basis
+        if self.noise is not None:
+            d[self.noise] = placed.d_joint
         return Placed(placed.Ts_root_frame, d)
 
     def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:

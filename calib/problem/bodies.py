@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.effects import Site, View
-from calib.forward import Term
+from calib.forward import RowsOf, Term
 from calib.problem import start
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
@@ -31,6 +31,7 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
     for b, body in enumerate(tracker.bodies if tracker else ()):
         poses = start.body_poses(part.source, body)
         point = start.is_point(part.source, body)
+        bases = {name: basis[:, b] for name, basis in here.bases.items()}
         for (root, _), index in places.stops.items():
             seen = index[np.isfinite(poses[index, 0, 3])]
             if not len(seen):
@@ -44,7 +45,7 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
                     sigma_m=tracker.sigma_m,
                     sigma_rad=tracker.sigma_rad,
                     is_point=point,
-                    bases={v: _rows(basis, seen)[:, b] for v, basis in here.bases.items()},
+                    bases=RowsOf(bases, seen),
                     by_place=here.by_place(seen, b),
                     stop_names=[(recording.folder, int(k)) for k in seen],
                     groups=tuple(Group("body", recording.stops[k], body, part.label) for k in seen),
@@ -163,10 +164,6 @@ def _tracker_bases(part: SourceStops) -> _Added:
         of_place=of_place,
         view=view,
     )
-
-
-def _rows(basis: np.ndarray, index: np.ndarray) -> np.ndarray:
-    return basis if len(basis) == 1 else basis[index]
 
 
 def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:

@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from calib.effects import View
-from calib.forward import Derivatives, Placed, Stops, Term, Values
+from calib.forward import Derivatives, Placed, Stops, Term, Values, stacked
 from calib.residuals.groups import Group
 from chains import se3
 
@@ -271,12 +271,7 @@ def evaluated(blocks: Sequence[SeenBody], values: Values) -> list[tuple[np.ndarr
 
 def _whole(blocks: Sequence[SeenBody]) -> SeenBody:
     first = blocks[0]
-    bases = {
-        n: np.concatenate(
-            [np.broadcast_to(b.bases[n], (len(b.measured), *x.shape[1:])) for b in blocks]
-        )
-        for n, x in first.bases.items()
-    }
+    bases = stacked([b.bases for b in blocks], [len(b.measured) for b in blocks])
     weights = [np.ones(len(b.measured)) if b.weight is None else b.weight for b in blocks]
     return replace(
         first,
