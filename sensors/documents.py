@@ -5,7 +5,6 @@ all or nothing: a file appears whole, under its own name, or not at all. This is
 """
 
 import json
-import math
 import os
 import re
 import stat
@@ -21,6 +20,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import pydantic
 import yaml
+from pydantic_core import to_json
 from yaml import composer, constructor, resolver
 
 from chains import escape
@@ -377,7 +377,8 @@ def write_json(path: str | Path, data: Any) -> None:
 
 def json_text(data: Any) -> str:
     """The data as a JSON document; a number that is not finite becomes null."""
-    return escape.json(json.dumps(_finite(plain(data)), indent=1, ensure_ascii=False))
+    text = to_json(data, indent=1, inf_nan_mode="null", fallback=plain)
+    return escape.json(text.decode("utf-8"))
 
 
 def plain(data: Any) -> Any:
@@ -389,11 +390,3 @@ def plain(data: Any) -> Any:
     if isinstance(data, list | tuple):
         return [plain(value) for value in data]
     return str(data) if isinstance(data, Path) else data
-
-
-def _finite(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
-    if isinstance(data, list):
-        return [_finite(value) for value in data]
-    return None if isinstance(data, float) and not math.isfinite(data) else data
