@@ -231,24 +231,31 @@ def _judged(
         known, limit = limit_of(own, others - own, count, looks)
         return known, limit, enough(own, known, limit)
 
-    for shift in some:
-        known, limit, least = bounds(shift.dof)
-        recording, where, what = shift.group.recording, shift.group.where, shift.group.what
+    def bulk_of(group: Group) -> float:
+        """How far out those of its kind are, there."""
         bulk = of_kind
         if uneven:
-            bulk = max(1.0, uneven.scale.get((recording, where), of_kind))
-        bulk = max(bulk, of_joint.get((recording, what), 0.0))
-        scaled = shift.statistic / bulk
-        p = float(special.fdtrc(shift.dof, known, scaled / shift.dof))
-        told = {u: np.diag(shift.information)[at].mean() for u, at in shift.parts.items()}
+            bulk = max(1.0, uneven.scale.get((group.recording, group.where), of_kind))
+        return max(bulk, of_joint.get((group.recording, group.what), 0.0))
+
+    own = np.array([shift.dof for shift in some])
+    bulk = np.array([bulk_of(shift.group) for shift in some])
+    known, limit, least = np.array([bounds(each) for each in own.tolist()]).T
+    scaled = np.array([shift.statistic for shift in some]) / bulk
+    p = special.fdtrc(own, known, scaled / own)
+    each = zip(
+        some, p, after_looks(p, looks), scaled, limit * own * bulk, least * bulk, strict=True
+    )
+    for shift, p_value, p_adjusted, statistic, beyond, found in each:
+        told = {u: shift.information[at, at].mean() for u, at in shift.parts.items()}
         yield Blunder(
             shift=shift,
-            p_value=at_least(p),
-            p_adjusted=float(after_looks(p, looks)),
-            evidence=-log_tail(scaled, shift.dof),
-            limit=float(limit * shift.dof * bulk),
-            enough=float(least * bulk),
-            detectable={u: float(np.sqrt(least * bulk / t)) for u, t in told.items() if t > 0},
+            p_value=at_least(p_value),
+            p_adjusted=float(p_adjusted),
+            evidence=-log_tail(statistic, shift.dof),
+            limit=float(beyond),
+            enough=float(found),
+            detectable={u: float(np.sqrt(found / t)) for u, t in told.items() if t > 0},
             looks=looks,
             uneven=uneven,
         )

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -61,8 +61,8 @@ class Shift:
     offset: np.ndarray
     covariance: np.ndarray
     information: np.ndarray
-    axes: Sequence[str]
-    units: Sequence[str]
+    axes: tuple[str, ...]
+    units: tuple[str, ...]
     squares: Squares = field(default_factory=dict)
 
     @property
@@ -70,11 +70,17 @@ class Shift:
         """Whether it is a range zero, and not a place."""
         return list(self.axes) == [ALONG_BEAMS]
 
-    @cached_property
-    def parts(self) -> dict[str, np.ndarray]:
+    @property
+    def parts(self) -> Mapping[str, np.ndarray]:
         """Unit -> directions (r,) in it, which have one length together."""
-        units = np.array(self.units)
-        return {unit: np.flatnonzero(units == unit) for unit in dict.fromkeys(self.units)}
+        return _of_units(self.units)
+
+
+@cache
+def _of_units(units: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Unit -> where it stands."""
+    names = np.array(units)
+    return {unit: np.flatnonzero(names == unit) for unit in dict.fromkeys(units)}
 
 
 def shifts(others: Others) -> list[Shift]:
@@ -213,6 +219,7 @@ def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
     held = dof < left.shape[1]
     left[held] = 0.0
     at = np.argmax(own, axis=0)
+    axes, units = (tuple(each[i] for i in at) for each in (first.axes, first.units))
     for k, group in enumerate(groups):
         yield Shift(
             group=group,
@@ -221,8 +228,8 @@ def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
             offset=offset[k],
             covariance=covariance[k],
             information=left[k],
-            axes=[first.axes[i] for i in at],
-            units=[first.units[i] for i in at],
+            axes=axes,
+            units=units,
             squares=squares[k],
         )
 
@@ -243,6 +250,7 @@ def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
     statistic = np.sum(values * np.square(along), axis=1)
     offset, covariance = -np.matvec(out, along), (out * over[:, None]) @ out.mT
     information = (told * values[:, None]) @ told.mT
+    along_which, units = (tuple(each[i] for i in at) for each in (first.axes, first.units))
     for k, group in enumerate(groups):
         yield Shift(
             group=group,
@@ -251,19 +259,18 @@ def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
             offset=offset[k],
             covariance=covariance[k],
             information=information[k],
-            axes=[first.axes[i] for i in at],
-            units=[first.units[i] for i in at],
+            axes=along_which,
+            units=units,
             squares=squares[k],
         )
 
 
 def _squares(some: Alike) -> Iterator[Squares]:
     """Of each place unit -> sum of squares of rows of it, and of their redundancies."""
-    units, left = np.array(some.rows[0].units), np.einsum("kii->ki", some.left)
+    left = np.einsum("kii->ki", some.left)
     each = {
         unit: (np.square(some.b[:, at]).sum(axis=1), left[:, at].sum(axis=1))
-        for unit in dict.fromkeys(some.rows[0].units)
-        if len(at := np.flatnonzero(units == unit))
+        for unit, at in _of_units(tuple(some.rows[0].units)).items()
     }
     for k in range(len(some.rows)):
         yield {unit: (float(b[k]), float(of[k])) for unit, (b, of) in each.items()}
