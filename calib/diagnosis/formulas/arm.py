@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import chain
 
 import numpy as np
-from scipy.sparse import csr_array, eye_array
+from scipy.sparse import csr_array
 
 from calib.diagnosis.formulas.factors import covariates_of
 from calib.diagnosis.formulas.table import BeamTable, rows_of_others
@@ -134,7 +134,7 @@ def _table(
         place=np.full(len(first), -1),
         share=1.0,
         twists=-full[first, :-1] * scale[:, None],
-        chain=csr_array(eye_array(A.shape[1], format="csr")),
+        chain=np.eye(A.shape[1]),
         others=full[rest, :-1],
         others_b=full[rest, -1],
         others_stop=stop[rest],

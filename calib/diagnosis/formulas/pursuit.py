@@ -20,7 +20,7 @@ from calib.blunders.chance import after_looks, at_least, log_tail
 from calib.diagnosis.formulas.factors import Factor, factors
 from calib.diagnosis.formulas.needed import needed
 from calib.diagnosis.formulas.smooths import Bases, Smooth, screen_smooths
-from calib.diagnosis.formulas.table import BeamTable, Projection
+from calib.diagnosis.formulas.table import BeamTable, Projection, together
 from calib.diagnosis.formulas.terms import FormulaTerm, refine
 from calib.diagnosis.score import ScoreTest
 from calib.solve.fit import Progress
@@ -43,7 +43,6 @@ AS = {"ring": "elevation_rad"}  # what goes along with another covariate
 # knots are few.
 COVERS = 0.9
 SAME_FORM = 1e-6  # of what two forms explain: one is the other and what the model absorbs
-COLUMNS_AT_ONCE = 64  # what fits into a processor's cache; 400 take half as long again
 
 
 @dataclass(frozen=True)
@@ -310,12 +309,7 @@ def _explained(
     projection: Projection, blocks: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """As `Projection.explained`, some columns at a time."""
-    parts: list[list[np.ndarray]] = [[]]
-    for block in blocks:
-        if sum(b.shape[1] for b in parts[-1]) + block.shape[1] > COLUMNS_AT_ONCE and parts[-1]:
-            parts.append([])
-        parts[-1].append(block)
-    found = [projection.explained(part) for part in parts]
+    found = [projection.explained(part) for part in together(blocks)]
     return tuple(np.concatenate(each) for each in zip(*found, strict=True))
 
 

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
 from calib.blunders.chance import log_tail
 from calib.diagnosis.formulas.factors import product_of
-from calib.diagnosis.formulas.table import BeamTable, Projection
-from calib.diagnosis.score import Scores, ScoreTest, score_test
+from calib.diagnosis.formulas.table import BeamTable, Projection, together
+from calib.diagnosis.score import ScoreTest, score_test
 from calib.diagnosis.screen import by_rank, looked
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
@@ -222,20 +222,20 @@ def _tested(
     progress: Callable[[int, int], None],
 ) -> Iterator[tuple[_Set, tuple[ScoreTest, np.ndarray]]]:
     """Each set's test, and by rank the p-values (R,) of the same on scores by chance."""
-    for i, each in enumerate(sets):
-        progress(i, len(sets))
-        columns = bases.columns(*each)
-        scores = projection.scores(columns)
-        found = score_test(scores, np.arange(columns.shape[1]))
-        if found.dof:
-            yield each, (found, _by_chance(scores, found, projection.table.signs))
-
-
-def _by_chance(scores: Scores, found: ScoreTest, signs: np.ndarray) -> np.ndarray:
-    # Every set has the same clusters in the same order, so the same draw of signs is one world.
-    shares = np.vstack([scores.by_stop, scores.by_place]) @ found.whiten
-    shares = shares.astype(signs.dtype)
-    return by_rank(np.sum(np.square(signs @ shares), axis=1))
+    signs, number = projection.table.signs, 0
+    for blocks in together(bases.columns(*each) for each in sets):
+        scores = projection.scores(np.hstack(blocks))
+        # Every set has the same clusters in the same order, so the same draw of signs is one world.
+        shares = np.vstack([scores.by_stop, scores.by_place]).astype(signs.dtype)
+        drawn = signs @ shares
+        ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
+        for at in (np.arange(*pair) for pair in pairwise(ends)):
+            progress(number, len(sets))
+            found = score_test(scores, at)
+            if found.dof:
+                by_chance = np.sum(np.square(drawn[:, at] @ found.whiten), axis=1)
+                yield sets[number], (found, by_rank(by_chance))
+            number += 1
 
 
 def _common(tests: Sequence[ScoreTest]) -> float:

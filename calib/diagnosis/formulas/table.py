@@ -7,11 +7,12 @@ catalogue; here for so few beams that thousands of columns are tried in seconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from scipy import linalg
 from scipy.sparse import block_diag, csr_array, diags_array, eye_array, hstack, issparse, vstack
 
 from calib.diagnosis.formulas.drawn import DrawnBeams
@@ -35,6 +36,7 @@ from calib.solve.estimate import Estimate
 MOST_BEAMS = 20_000
 FORMULA_DRAWS = 499  # scores of chance: 25 of them beyond the quantile that counts looks
 Matrix = csr_array | np.ndarray
+COLUMNS_AT_ONCE = 64  # what fits into a processor's cache; 400 take half as long again
 WEIGHING_PASSES = 3  # of weighing, after which weights of a gross structure change by less than 1 %
 
 
@@ -51,8 +53,9 @@ class BeamTable:
         twists: (N, V) derivative of the residual by twists of the LiDAR, stop by stop, and by the
             U unknowns that act on beams otherwise.
         chain: (V, U) of these by all unknowns.
-        others: (R, U) whitened rows of trackers, targets and priors; like `twists` sparse of beams,
-            and dense of an arm, all of whose unknowns act on each pose; others_b: (R,) their right
+        others: (R, U) whitened rows of trackers, targets and priors; like `twists` and `chain`
+            sparse of beams, and dense of an arm, all of whose unknowns act on each pose; others_b:
+            (R,) their right
             side; others_stop, others_place: (R,) of which they are, -1 for none.
         unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
         joints: which covariates are joints of the arm.
@@ -69,7 +72,7 @@ class BeamTable:
     place: np.ndarray
     share: float
     twists: Matrix
-    chain: csr_array
+    chain: Matrix
     others: Matrix
     others_b: np.ndarray
     others_stop: np.ndarray
@@ -166,7 +169,10 @@ class BeamTable:
         """The table of a model that has such columns (N, F) of the range, too: its last unknowns,
         of which nothing was known."""
         more = columns_m.shape[1]
-        chain = block_diag([self.chain, eye_array(more)], format="csr")
+        if issparse(self.chain):
+            chain = block_diag([self.chain, eye_array(more)], format="csr")
+        else:
+            chain = linalg.block_diag(self.chain, np.eye(more))
         others = _wider(self.others, np.zeros((len(self.others_b), more)))
         twists = _wider(self.twists, -columns_m)
         return replace(self, twists=twists, chain=chain, others=others)
@@ -318,6 +324,18 @@ class Projection:
         others = table.others @ (taken @ found.whiten)
         shares.add(others, table.others_stop, table.others_place)
         return found.judged(shares, scores)
+
+
+def together(blocks: Iterable[np.ndarray]) -> Iterator[list[np.ndarray]]:
+    """Blocks of columns (N, k), in order, as many at a time as are best multiplied at once."""
+    some: list[np.ndarray] = []
+    for block in blocks:
+        if some and sum(each.shape[1] for each in (*some, block)) > COLUMNS_AT_ONCE:
+            yield some
+            some = []
+        some.append(block)
+    if some:
+        yield some
 
 
 def _wider(left: Matrix, right: np.ndarray) -> Matrix:
