@@ -1,16 +1,17 @@
 """Compiled loops over beams (the numba door): where each meets its plane, and sums of its rows.
 
 They release the interpreter, so stops run side by side. numba keeps what it compiled beside this
-file, so a second start pays nothing. Each is checked against numpy in the tests.
+file, so a second start pays nothing; an arm without a LiDAR does not even load it. Each is checked
+against numpy in the tests.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, wraps
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
 
 F = TypeVar("F", bound=Callable[..., Any])
 OPTIONS = {"nogil": True, "error_model": "numpy"}  # a division by zero is infinite, as numpy has it
@@ -19,6 +20,18 @@ OPTIONS = {"nogil": True, "error_model": "numpy"}  # a division by zero is infin
 def compiled(function: F) -> F:
     """The function, compiled when first called, and kept on disk for the next start; where no
     folder can be written to it is compiled at every start."""
+
+    @wraps(function)
+    def called(*args: Any) -> Any:
+        return _made(function)(*args)
+
+    return called
+
+
+@cache
+def _made(function: Callable[..., Any]) -> Callable[..., Any]:
+    from numba import njit  # late: it takes a quarter of a second
+
     try:
         return njit(cache=True, **OPTIONS)(function)
     except RuntimeError:  # numba finds no place for its cache

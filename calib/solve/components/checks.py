@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 # Of a variance; no less and no more is found at once. Joints read to 0.1 mrad may scatter by 1 rad.
 GROWN = np.geomspace(1e-3, 1e8, 78) - 1.0
@@ -84,6 +83,8 @@ class Checks:
         """The d of greatest restricted likelihood, down to -1 where nothing tells."""
         if self.told <= 0:
             return -1.0
+        from scipy.optimize import minimize_scalar  # late: it loads much, and most fits need none
+
         best = int(np.argmax([self.statistic(d) for d in GROWN]))
         around = GROWN[max(best - 1, 0)], GROWN[min(best + 1, len(GROWN) - 1)]
         found = minimize_scalar(

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from calib.linear.elimination import inverse_and_log_det
 from calib.problem.spread import spread_keys
@@ -158,6 +157,8 @@ def _likeliest(
     least: np.ndarray | None = None,
 ) -> np.ndarray:
     """The sd (G,) of each group, from a start (G,); no less than `least` (G,)."""
+    from scipy.optimize import minimize  # late: it loads much, and most fits need none
+
     first = 2.0 * np.log(start)
     least = LEAST_SD * start if least is None else least
     bounds = np.stack([2.0 * np.log(least), first + 2.0 * np.log(LARGEST_SD)], axis=1)
