@@ -6,6 +6,8 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -139,13 +141,30 @@ def _archive(path: Path) -> dict[str, np.ndarray]:
         return arrays
 
 
+# Version of a file -> bytes of the length of its header, and what reads that.
+_HEADERS = {
+    1: (2, np.lib.format.read_array_header_1_0),
+    2: (4, np.lib.format.read_array_header_2_0),
+}
+
+
+@lru_cache(maxsize=64)
+def _header(version: int, header: bytes) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, whether in Fortran's order, and dtype. A run's state has the same few headers
+    thousands of times, and each is parsed as Python."""
+    _, read = _HEADERS[version]
+    return read(BytesIO(header))
+
+
 def _array(path: Path, file: BinaryIO, size: int) -> np.ndarray:
     """One array, of a file or member of `size` bytes."""
-    version = np.lib.format.read_magic(file)
-    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-    if version[0] not in read:
-        raise InputError(f"{path}: version {version[0]} of NumPy's files is not read; save it anew")
-    shape, fortran, dtype = read[version[0]](file)
+    version, _ = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise InputError(f"{path}: version {version} of NumPy's files is not read; save it anew")
+    size_of, _ = _HEADERS[version]
+    length = file.read(size_of)
+    header = length + file.read(int.from_bytes(length, "little"))
+    shape, fortran, dtype = _header(version, header)
     if dtype.hasobject:
         raise InputError(f"{path} holds Python objects, which are not read; save numbers")
     count = 1

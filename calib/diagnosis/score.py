@@ -92,9 +92,10 @@ class Scores:
     @cached_property
     def draws(self) -> np.ndarray:
         """Scores (R, Q) as chance might have dealt them: every cluster's share, times a normal
-        number of its own (the multiplier bootstrap)."""
-        shares = np.vstack([self.by_stop, self.by_place])
-        return np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares))) @ shares
+        number of its own (the multiplier bootstrap). In single precision, which is enough."""
+        shares = np.vstack([self.by_stop, self.by_place]).astype(np.float32)
+        signs = np.random.default_rng(0).standard_normal((SCORE_DRAWS, len(shares)))
+        return signs.astype(np.float32) @ shares
 
 
 def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -368,7 +368,9 @@ def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> Non
 def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Rows (K, m, n) of some columns (n,), each (K m,) among the columns that stand somewhere in
     `at`."""
-    rows, there = rows.reshape(-1, rows.shape[2]), at[columns] >= 0
-    out = np.zeros((len(rows), int(at.max(initial=-1)) + 1))
-    out[:, at[columns[there]]] = rows[:, there]
+    rows, to, width = rows.reshape(-1, rows.shape[2]), at[columns], int(at.max(initial=-1)) + 1
+    if np.array_equal(to, np.arange(width)):
+        return rows
+    out = np.zeros((len(rows), width))
+    out[:, to[to >= 0]] = rows[:, to >= 0]
     return out

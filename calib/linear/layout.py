@@ -91,7 +91,7 @@ class Layout:
         }
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
-            own.setdefault(owner[name], []).append(_join(at, [name]))
+            own.setdefault(owner[name], []).append(np.r_[at[name]])
         finest, cells = (_join(at, names) for names in _cells(unknowns))
         inner = [*own.values(), [finest], [cells]]
         eliminated = np.concatenate([c for part in inner for c in part]).astype(int)

@@ -132,9 +132,12 @@ def _joints(problem: Problem) -> dict[Whose, tuple[float, float]]:
     """Joints that are read anywhere -> the sigma of their readings, and how much of it is beyond
     what it was at first."""
     out: dict[Whose, tuple[float, float]] = {}
+    wanted: dict[object, np.ndarray] = {}  # of each arm's joints, those of which none is read yet
     for unknown in readings(problem):
-        for i in np.flatnonzero(is_read(unknown.sigma)):
-            joint = unknown.dofs[i]
+        like = unknown.dofs, unknown.units
+        left = wanted.setdefault(like, np.ones(unknown.dim, bool))
+        for i in np.flatnonzero(left & is_read(unknown.sigma)) if left.any() else ():
+            joint, left[i] = unknown.dofs[i], False
             found = float(unknown.sigma[i]), unknown.scatter.get(joint, 0.0)
             out.setdefault(Whose("joints", joint, unknown.units[i]), found)
     return out

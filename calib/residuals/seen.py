@@ -212,7 +212,8 @@ class BodiesTogether:
         """Blocks, grouped by what they share."""
         groups: dict[object, list[SeenBody]] = {}
         for block in blocks:
-            shared = tuple(n for n in block.variables if n not in block.stops.own)
+            own = block.stops.own
+            shared = tuple(n for n in block.variables if n not in own)
             like = (block.kind, block.body, block.axes, id(block.stops.rig), len(block.measured))
             groups.setdefault((*like, shared, block.stops.noise is None), []).append(block)
         return [cls(found, _whole(found)) for found in groups.values()]

@@ -151,7 +151,7 @@ class Rig:
         known = {j.name: j for e in self.tree.edges if (j := e.joint) is not None and j.leads}
         return tuple(known[name] for name in self.joint_names)
 
-    @property
+    @cached_property
     def joint_kinds(self) -> tuple[str, ...]:
         """ "revolute" or "prismatic", by joint."""
         return tuple(joint.kind for joint in self.joints)
