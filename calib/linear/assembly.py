@@ -303,7 +303,7 @@ class Assembly:
                 Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
                 rows = Q.mT @ rows
                 R, over = R[:, :count], mine[count:]
-                gains = np.linalg.solve(R, rows[:, :count, count:])
+                gains = np.linalg.inv(R) @ rows[:, :count, count:]
                 self.eliminated += [
                     Eliminated(self._own(stop), over, root.T, gain)
                     for stop, root, gain in zip(some, R, gains, strict=True)

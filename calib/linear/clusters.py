@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-CLUSTERS_AT_ONCE = 256  # in one dense product: about those of four stops with a LiDAR
+CLUSTERS_AT_ONCE = 64  # in one dense product: about those of a stop with a LiDAR
 
 
 def summed(values: np.ndarray, at: np.ndarray, count: int | None = None) -> np.ndarray:
