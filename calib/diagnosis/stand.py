@@ -181,7 +181,7 @@ class Stand:
         for i in chosen.tolist() if scans else ():
             rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
             columns |= set(rows.view.columns)
-            if np.isfinite(scans[i].store.read(scans[i].index)[0].range_std_m).any():
+            if scans[i].store.read(scans[i].index)[0].spread_known.any():
                 columns.add("range_std_m")
             own = _own_columns(scans[i])
             looked_at = {*covariates(), *own}

@@ -47,7 +47,7 @@ def spread_rows(
         usable: (N,) whether a beam met anything.
         growth: variable -> (N, P) of log sigma, per unit.
     """
-    known = np.isfinite(scan.range_std_m) & (scan.count > 1) & usable
+    known = scan.spread_known & usable
     if not growth or known.sum() < 2:
         return None
     dof = np.where(known, scan.count - 1.0, 0.0)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig import Rig
+from calib.rig.columns import PAYLOAD
 from calib.rig.suspect import listed
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
@@ -25,6 +26,9 @@ NARROW_RAD = np.radians(30.0)
 # Mass over the cube of an arm's length, kg/m3: of arms for sale 13 (UR10, 29 kg, 1.3 m) to 143 (a
 # KR 1000, 4,700 kg, 3.2 m). Ten times less or more is no arm's, but in grams or tonnes it would be.
 LIGHTEST, HEAVIEST = 1.3, 1430.0
+# What the strongest arms for sale carry. No arm carries more than it weighs, either: of those for
+# sale a fifth (KR 1000) to a half (iiwa 14) of that.
+HEAVIEST_LOAD_KG = 2300.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
@@ -153,6 +157,20 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
             yield f"{body} is seen at {at.sum()} of {len(at)} stops only; look for what hides it"
     if seen and (unseen := names[~np.any(list(seen.values()), axis=0)]).size:
         yield f"no tracked body is seen at {listed(unseen)}; what they tell rests on their scans"
+
+
+def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
+    """Payloads that no arm carries."""
+    for name in {PAYLOAD, *(f"{tip}.{PAYLOAD}" for tip in rig.tips)} & set(recording.covariates):
+        kg = np.nan_to_num(recording.covariates[name])
+        most = min(HEAVIEST_LOAD_KG, sum(float(mass.kg) for mass in rig.masses) or np.inf)
+        if kg.min(initial=0.0) < 0.0:
+            yield f"{name} goes down to {kg.min():g} in stops.csv; a load is not below 0"
+        elif kg.max(initial=0.0) > most:
+            yield (
+                f"{name} goes up to {kg.max():g} in stops.csv, more than such an arm carries "
+                f"({most:.3g} kg); is it in grams?"
+            )
 
 
 def odd_levels(recording: RecordedStops) -> Iterator[str]:

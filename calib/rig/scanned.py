@@ -31,6 +31,7 @@ class ScanSums:
         columns: names of the per-point covariates.
         intensity: scan -> its largest intensity, where it has any.
         darkest: the least intensity.
+        rounded: scans half of whose spreads are 0, see `Scan.spread_known`.
         reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
         contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
             "points" stands for x, y and z.
@@ -44,6 +45,7 @@ class ScanSums:
     columns: dict[str, None] = field(default_factory=dict)
     intensity: dict[str, float] = field(default_factory=dict)
     darkest: float = np.inf
+    rounded: list[str] = field(default_factory=list)
     reach_m: float = 0.0
     contents: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
@@ -68,6 +70,9 @@ class ScanSums:
         if np.isfinite(scan.intensity).any():
             self.intensity[name] = float(np.nanmax(scan.intensity))
             self.darkest = min(self.darkest, float(np.nanmin(scan.intensity)))
+        told = np.isfinite(scan.range_std_m) & (scan.count > 1)
+        if told.any() and not scan.spread_known.any():
+            self.rounded.append(name)
         for column, values in {
             "points": scan.xyz_m,
             "intensity": scan.intensity,
@@ -112,6 +117,11 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
     numbered = numbering(scans)
     if numbered is not None:
         yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    if scans.rounded:
+        yield (
+            f"half of range_std_m or more is 0 at {listed(scans.rounded)}, so it is not used "
+            "there; leave it empty where it is unknown"
+        )
     yield from _at_once(recording)
     yield from _twice(scans)
     yield from _intensities(scans)
@@ -122,14 +132,16 @@ def numbering(scans: ScanSums) -> RingFinding | None:
     return odd_rings(scans.lidar, ring_elevations(scans.elevation_rad, scans.rings))
 
 
-def _at_once(recording: RecordedStops) -> Iterator[Suspect]:
+def _at_once(recording: RecordedStops) -> Iterator[str]:
     """Stops with scans at one and the same time."""
     at = np.flatnonzero(recording.has_scan & recording.timed)
     _, same, count = np.unique(recording.time_s[at], return_inverse=True, return_counts=True)
     for each in np.flatnonzero(count > 1):
-        stops = tuple(recording.stops[k] for k in at[same == each])
-        said = f"the scans of {' and '.join(stops)} were made at one time, time_s; is one a copy?"
-        yield Suspect("scan", stops[0], said, stops=stops)
+        stops = [recording.stops[k] for k in at[same == each]]
+        yield (
+            f"the scans of {' and '.join(stops)} were made at one time, time_s: is the clock "
+            "right, and is none a copy?"
+        )
 
 
 def _twice(scans: ScanSums) -> Iterator[Suspect]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,7 @@ def calibrate(
         sources, model = placed(leave_out(opened, model.without), model)
         choices = _Choices(Path(out), hold_out, folds, prior)
         document = _model_document(sources, model, choices)
+        _refuse_copies(document["recordings"])
         with going_on(outputs.kept(folder, document)):
             try:
                 _fit(sources, model, document, folder, choices, progress)
@@ -268,6 +270,14 @@ def _refuse_twice(recordings: Sequence[Path]) -> None:
     for recording in recordings:
         if recordings.count(recording) > 1:
             raise InputError(f"{recording} is given twice; as data it counts once")
+
+
+def _refuse_copies(recordings: Sequence[Mapping[str, str]]) -> None:
+    for one, other in combinations(recordings, 2):
+        if one["sha256"] == other["sha256"]:
+            raise InputError(
+                f"{one['path']} and {other['path']} hold the same; as data they count once"
+            )
 
 
 def _refuse_nothing(problem: Problem, seen: Errors) -> None:
