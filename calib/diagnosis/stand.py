@@ -15,6 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.diagnosis.candidates import covariates, finer, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
+from calib.diagnosis.chance.in_turn import p_in_turn
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
@@ -252,6 +253,16 @@ class Look:
         of_rows = rows_by_chance(wider, self.blunders, self.others)
         of_poses = of_lidar(posed, self.blunders, self.others)
         return ranked([*self.values, *of_poses, *of_rows])
+
+    def still(self, some: Sequence[Chance]) -> list[Chance]:
+        """Those of some effects by chance, all of them in this look's model, that are found beside
+        all else in it."""
+        beside = (chance.beside(self.stand.estimate) for chance in some)
+        return [
+            replace(c, p_in_turn=p_in_turn(c.effect, self.others, self.blunders))
+            for c in beside
+            if c.found
+        ]
 
     @property
     def checked(self) -> set[Group]:

@@ -160,14 +160,13 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         rivals = tuple(dict.fromkeys(c.effect.name for c in alike))
         chance[-1] = replace(strongest, rivals=rivals)
     last = looks[-1]
-    still = (c.beside(last.stand.estimate) for c in chance)
     done = Search(
         looks=looks,
         found=found,
         blunders=left,
         unnamed=structures(last, progress) if most else (),
         scatter=scattering(last, progress) if most else None,
-        chance=[c for c in still if c.found],
+        chance=last.still(chance),
         unsettled=unsettled,
     )
     by_chance = [*done.chance, *([done.unsettled] if done.unsettled else [])]
@@ -213,7 +212,7 @@ def nameless(done: Search, progress: Progress) -> Search:
         looks=[done.looks[0], look],
         found=(),
         scatter=scattering(look, progress),
-        chance=[c for c in (each.beside(less.estimate) for each in done.chance) if c.found],
+        chance=look.still(done.chance),
     )
 
 

@@ -1,0 +1,92 @@
+"""Whether what seems to scatter from stop to stop goes in turn: stops that follow each other err
+alike, as where something drifts, or was changed in between and changed back.
+
+With r_k the errors of the k-th stop in time, ``S = sum r_k . r_(k+1)``. Where errors are random,
+each might as well have the other sign, and then S has the mean 0 and the variance ``sum (r_k .
+r_(k+1))^2``, however widely any of them scatters (the serial correlation of von Neumann 1941, by
+signs as in `jackknife`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import special
+
+from calib.blunders.judged import Blunder
+from calib.blunders.others import Others
+from calib.effects import Scatter, Site
+from calib.problem.model import Source, labels
+
+FEWEST_IN_TURN = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
+OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
+
+
+def p_in_turn(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
+    """How often chance makes errors that follow each other so much alike; 1 where nothing tells.
+
+    Args:
+        effect: what seems to scatter; it is in the model.
+        others: all rows of the fit of that model.
+        blunders: all groups of them, as `judge` has them.
+    """
+    turn = {
+        (label, stop): at
+        for source, label in zip(
+            others.problem.sources, labels(others.problem.sources), strict=True
+        )
+        for at, stop in enumerate(_in_time(source))
+    }
+    if effect.widens:
+        series = _of_rows(OF_ROWS.get(effect.site, ""), blunders, turn)
+    else:
+        series = _of_values(effect, others, turn) if effect.per == "stop" else iter(())
+    p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_TURN]
+    return min(1.0, len(p) * min(p)) if p else 1.0
+
+
+def _in_time(source: Source) -> list[str]:
+    """The stops of a recording as they were made; as its table has them where it has no times."""
+    recording = source.recording
+    order = np.arange(len(recording.stops))
+    if np.all(recording.timed):
+        order = np.argsort(recording.time_s, kind="stable")
+    return [recording.stops[k] for k in order]
+
+
+def _of_rows(
+    kind: str, blunders: list[Blunder], turn: dict[tuple[str, str], int]
+) -> Iterator[np.ndarray]:
+    """Errors (K, r) of each body, or each joint, in its sigmas, in the order of time."""
+    found: dict[tuple[str, str, int], list[tuple[int, np.ndarray]]] = {}
+    for shift in (b.shift for b in blunders if b.group.kind == kind and not b.found):
+        at = turn.get((shift.group.recording, shift.group.where))
+        if at is not None and shift.dof == len(shift.offset):
+            key = shift.group.recording, shift.group.what, shift.dof
+            error = shift.offset / np.sqrt(np.diag(shift.covariance))
+            found.setdefault(key, []).append((at, error))
+    for some in found.values():
+        yield np.stack([error for _, error in sorted(some, key=lambda each: each[0])])
+
+
+def _of_values(
+    effect: Scatter, others: Others, turn: dict[tuple[str, str], int]
+) -> Iterator[np.ndarray]:
+    """Values (K, r) of the stops of each recording, in the order of time."""
+    named = zip(others.problem.terms, labels(others.problem.sources), strict=True)
+    for term, label in ((t, label) for some, label in named for t in some):
+        if term.effect.name == effect.name:
+            known = {
+                f"{term.effect.label}{stop}": at for (of, stop), at in turn.items() if of == label
+            }
+            values = others.whole.values[term.variable].reshape(len(term.effect.members), -1)
+            mine = [k for k, member in enumerate(term.effect.members) if member in known]
+            yield values[sorted(mine, key=lambda k: known[term.effect.members[k]])]
+
+
+def _alike(errors: np.ndarray) -> float:
+    """One-sided p-value of S for errors (K, r) in the order of time."""
+    products = np.einsum("ki,ki->k", errors[:-1], errors[1:])
+    sd = float(np.sqrt(np.square(products).sum()))
+    return float(special.ndtr(-products.sum() / max(sd, 1e-300)))
