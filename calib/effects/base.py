@@ -124,6 +124,8 @@ class Effect(ABC):
             "tracked", at the tracker's site, is computed anew wherever a fit has the body.
         unit: of its parameters, of all of them if they differ; of revolute joints.
         formula, typical, confounded_with, source: the catalogue's page.
+        twin: what else does the very same to all that is measured, and is no effect of the
+            catalogue; as a sentence names it.
         shape_name: what the shape is, with its unit (``wavelength_m``); empty where there is none.
         shape: the one chosen.
         whole: True where a shape is a whole number.
@@ -146,6 +148,7 @@ class Effect(ABC):
     covariates: ClassVar[tuple[str, ...]] = ()
     confounded_with: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str] = ""
+    twin: ClassVar[str] = ""
     shape_name: ClassVar[str] = ""
     shape: float = 0.0
     whole: ClassVar[bool] = False

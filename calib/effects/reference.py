@@ -31,7 +31,11 @@ class FaroScale(Effect):
 
 class MeshShift(Effect):
     """The mesh is not in the frame of the spheres: a scan was registered wrongly, or the mesh was
-    exported in another frame."""
+    exported in another frame.
+
+    A tracker whose frame was set anew between the targets and the stops looks the very same. Which
+    of the two it is decides where the reference's frame is.
+    """
 
     name = "mesh_shift"
     site = Site.REFERENCE
@@ -41,6 +45,7 @@ class MeshShift(Effect):
     covariates = ("point_m",)
     confounded_with = ("target_rod_tilt", "target_sphere_offset", "stop_pose_scatter")
     source = "size assumed"
+    twin = "a tracker whose frame was set anew between the targets and the stops"
 
     @property
     def of_scanner(self) -> bool:

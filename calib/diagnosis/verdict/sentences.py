@@ -211,6 +211,8 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
         f"{candidate['rms_mm']:.2f} mm rms, of which {candidate['unabsorbed_rms_mm']:.2f} mm is "
         f"not absorbed by the model (adjusted p = {step.p_adjusted:.1g}){fall}."
     ]
+    if step.effect.twin:
+        out.append(f"Nothing that was measured tells it from {step.effect.twin}.")
     return [*out, *map(rival_sentence, candidate["rivals"][:MOST_LISTED])]
 
 
