@@ -226,6 +226,13 @@ def test_a_fit_refuses_an_argument_in_one_sentence(rec, refused, monkeypatch, ar
         assert part in sentence, sentence
 
 
+def test_a_copy_of_a_recording_is_refused(rec, refused):
+    """As data it counts once, wherever it is."""
+    shutil.copytree(rec, rec.parent / "copy")
+    sentence = refused("fit", rec, rec.parent / "copy", "-o", rec.parent / "run")
+    assert "rec and " in sentence and "copy hold the same" in sentence
+
+
 def test_what_is_no_run_is_not_replaced(rec, refused):
     sentence = refused("fit", rec, "-o", rec)
     assert "rec exists" in sentence and "another folder" in sentence

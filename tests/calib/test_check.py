@@ -13,7 +13,7 @@ from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.solution import solution_of
-from calib.rig.inventory import PlacedScan, odd_beams, odd_rig
+from calib.rig.inventory import PlacedScan, odd_beams, odd_payloads, odd_rig
 from calib.solve.fit import solve
 from chains import se3
 from chains.arm import Mass
@@ -264,6 +264,21 @@ def test_targets_that_are_mixed_up(rec):
     odd = check(rec).odd
     assert any(line.startswith("the rod of t3 does not hang as the others do") for line in odd), odd
     assert any(line.startswith("tracker and scanner place t") for line in odd), odd
+
+
+def test_payloads_that_no_arm_carries():
+    def odd(*kg, masses=(10.0, 8.0)):
+        """What is said of loads on an arm whose links weigh so much."""
+        rig = SimpleNamespace(tips=["flange"], masses=[SimpleNamespace(kg=m) for m in masses])
+        columns = {"payload_kg": np.array(kg), "temperature_c": np.full(len(kg), -300.0)}
+        return list(odd_payloads(rig, SimpleNamespace(covariates=columns)))
+
+    assert odd(0.0, 5.0, np.nan) == odd(100.0, masses=()) == []
+    (said,) = odd(0.0, 2500.0)
+    assert "payload_kg goes up to 2500" in said and "(18 kg)" in said and "in grams?" in said
+    assert "in grams?" in odd(5000.0, masses=())[0]
+    (said,) = odd(0.0, -2.5)
+    assert "down to -2.5" in said
 
 
 def test_a_sigma_in_millimetres(rec):

@@ -215,9 +215,22 @@ def test_scans_at_one_time(scans):
     rig, recording, read = scans
     time_s = recording.time_s.copy()
     time_s[5] = time_s[4]
-    found = only(said((rig, replace(recording, time_s=time_s), read)))
-    assert found.stops == tuple(recording.stops[4:6]) and "at one time" in found.sentence
+    said_of_it = only(said((rig, replace(recording, time_s=time_s), read)))
+    assert f"{recording.stops[4]} and {recording.stops[5]} were made at one time" in said_of_it
     assert said((rig, replace(recording, time_s=time_s * np.nan), read)) == []
+
+
+def test_spreads_of_nought_are_told(scans):
+    """Those of a scan half of which has none; what scatters less here and there is left alone."""
+    a, b, _ = scans[2]
+
+    def spread(scan, still):
+        nought = np.arange(len(scan.ring)) < still * len(scan.ring)
+        known = replace(scan, count=np.full(len(scan.ring), 20.0))
+        return replace(known, range_std_m=np.where(nought, 0.0, 0.01))
+
+    said_of_it = only(said(scans, **{a: lambda s: spread(s, 0.6), b: lambda s: spread(s, 0.4)}))
+    assert f"range_std_m or more is 0 at {a}, so" in said_of_it
 
 
 @pytest.mark.parametrize(

@@ -190,6 +190,20 @@ def test_an_averaged_scan_is_read_as_written(write):
     assert list(scan.extra) == ["signal"] and scan.extra["signal"].tolist() == [1, 2, 3]
 
 
+@pytest.mark.parametrize(
+    ("spread_m", "count", "known"),
+    [
+        ([0.01, 0.02, 0.03], [20, 20, 20], [True, True, True]),
+        ([0.0, 0.02, 0.03], [20, 20, 20], [True, True, True]),  # one of them by chance
+        ([0.0, 0.0, 0.03], [20, 20, 20], [False, False, False]),  # nothing was recorded
+        ([0.01, np.nan, 0.0], [20, 20, 1], [True, False, False]),  # one sweep has no spread
+    ],
+)
+def test_which_spreads_say_how_far_sweeps_scatter(write, spread_m, count, known):
+    columns = cloud(count=np.array(count), range_std_m=np.array(spread_m))
+    assert open_cart(write(scans={"a": columns})).scan(0).spread_known.tolist() == known
+
+
 def test_what_a_scan_does_not_say_is_unknown_and_no_returns_are_left_out(write):
     columns = cloud(
         intensity=None, x=np.array([1, np.nan, 0], np.float32), z=np.zeros(3, np.float32)
