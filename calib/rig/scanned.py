@@ -15,6 +15,8 @@ from sensors.recording import RecordedStops, Scan
 from sensors.rings import RingFinding, odd_rings, ring_elevations
 
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
+DOUBLED = 1 / 3  # a choice: of points by chance none repeats another; of a copy half do
+PRIMES = (2, 3, 5, 7, 11)  # by whose roots columns are added up: no two rows come to one number
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
 
 
@@ -31,6 +33,7 @@ class ScanSums:
         columns: names of the per-point covariates.
         intensity: scan -> its largest intensity, where it has any.
         darkest: the least intensity.
+        doubled: scans of which a third of the points or more are there once more.
         rounded: scans half of whose spreads are 0, see `Scan.spread_known`.
         reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
         contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
@@ -46,6 +49,7 @@ class ScanSums:
     intensity: dict[str, float] = field(default_factory=dict)
     darkest: float = np.inf
     rounded: list[str] = field(default_factory=list)
+    doubled: list[str] = field(default_factory=list)
     reach_m: float = 0.0
     contents: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
@@ -70,6 +74,9 @@ class ScanSums:
         if np.isfinite(scan.intensity).any():
             self.intensity[name] = float(np.nanmax(scan.intensity))
             self.darkest = min(self.darkest, float(np.nanmin(scan.intensity)))
+        sweep = scan.extra.get("scan", np.zeros(len(scan.ring)))  # of raw scans
+        if _alike(np.column_stack([scan.xyz_m, scan.ring, sweep])) > DOUBLED:
+            self.doubled.append(name)
         told = np.isfinite(scan.range_std_m) & (scan.count > 1)
         if told.any() and not scan.spread_known.any():
             self.rounded.append(name)
@@ -82,6 +89,12 @@ class ScanSums:
             if len(np.unique(values[:1000])) >= LEAST_VALUES:
                 key = column, hashlib.sha256(np.ascontiguousarray(values)).hexdigest()
                 self.contents.setdefault(key, []).append(name)
+
+
+def _alike(rows: np.ndarray) -> float:
+    """The share of rows (N, n) that repeat another one."""
+    mixed = sum(by * column for by, column in zip(np.sqrt(PRIMES), rows.T, strict=True))
+    return 1.0 - len(np.unique(mixed)) / len(rows)
 
 
 def of_scans(scans: ScanSums) -> Iterator[tuple[str, str]]:
@@ -117,6 +130,11 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
     numbered = numbering(scans)
     if numbered is not None:
         yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    if scans.doubled:
+        yield (
+            f"points of {listed(scans.doubled)} are there twice, and would count as independent; "
+            "were they recorded twice?"
+        )
     if scans.rounded:
         yield (
             f"half of range_std_m or more is 0 at {listed(scans.rounded)}, so it is not used "

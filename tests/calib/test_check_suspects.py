@@ -233,6 +233,26 @@ def test_spreads_of_nought_are_told(scans):
     assert f"range_std_m or more is 0 at {a}, so" in said_of_it
 
 
+def test_points_that_are_there_twice_are_told(scans):
+    """All of a scan; some that are there by chance are not, nor sweeps of a raw scan."""
+    a, b, c = scans[2]
+
+    def again(scan, count, sweep=None):
+        at = np.r_[np.arange(len(scan.ring)), np.arange(count)]
+        extra = {} if sweep is None else {"scan": np.r_[np.zeros(len(scan.ring)), sweep]}
+        rows = {name: getattr(scan, name)[at] for name in
+                ("xyz_m", "ring", "column", "intensity", "count", "range_std_m")}  # fmt: skip
+        return replace(scan, **rows, extra=extra)
+
+    every = len(scans[2][c].ring)
+    found = said(
+        scans,
+        **{a: lambda s: again(s, len(s.ring)), b: lambda s: again(s, 10)},
+        **{c: lambda s: again(s, every, sweep=np.ones(every))},
+    )
+    assert f"points of {a} are there twice" in only(found)
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
