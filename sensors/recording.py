@@ -53,14 +53,6 @@ class Scan:
     extra: dict[str, Array]
     """Every other numeric column, each (N,): per-point covariates."""
 
-    @property
-    def spread_known(self) -> NDArray[np.bool_]:
-        """(N,) whether `range_std_m` says how far the sweeps that were averaged into a point
-        scatter. Where half of them are 0 none does: nothing was recorded, or ranges are rounded to
-        more than they scatter."""
-        known = np.isfinite(self.range_std_m) & (self.count > 1)
-        return known & bool(known.any() and np.median(self.range_std_m[known]) > 0.0)
-
     def columns(self) -> Columns:
         """All columns by the names of the scan file, each (N,): x y z in m, ring, column, …"""
         return {

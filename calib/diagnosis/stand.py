@@ -32,6 +32,7 @@ from calib.results.intervals import Intervals, intervals
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
+from sensors.holds import spread_known
 
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
@@ -182,7 +183,8 @@ class Stand:
         for i in chosen.tolist() if scans else ():
             rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
             columns |= set(rows.view.columns)
-            if scans[i].store.read(scans[i].index)[0].spread_known.any():
+            scan, _ = scans[i].store.read(scans[i].index)
+            if spread_known(scan.range_std_m, scan.count).any():
                 columns.add("range_std_m")
             own = _own_columns(scans[i])
             looked_at = {*covariates(), *own}

@@ -34,6 +34,7 @@ from calib.residuals.store import BeamStore, SomeBeams, common_median, drawn_of_
 from calib.residuals.surfaces import Meeting
 from chains import se3
 from chains.errors import InputError
+from sensors.holds import spread_known
 from sensors.lidar import Beams, LidarModel
 from sensors.recording import RecordedStops, Scan
 
@@ -367,7 +368,7 @@ class ScanStop:
         were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
         """
         measured = np.square(scan.range_std_m)
-        known = scan.spread_known & usable
+        known = spread_known(scan.range_std_m, scan.count) & usable
         if known.any():
             single = single * np.median((measured / single)[known])
             dof = np.where(known, scan.count - 1.0, 0.0)

@@ -161,7 +161,9 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
 
 def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Payloads that no arm carries."""
-    for name in {PAYLOAD, *(f"{tip}.{PAYLOAD}" for tip in rig.tips)} & set(recording.covariates):
+    for name in (PAYLOAD, *(f"{tip}.{PAYLOAD}" for tip in rig.tips)):
+        if name not in recording.covariates:
+            continue
         kg = np.nan_to_num(recording.covariates[name])
         most = min(HEAVIEST_LOAD_KG, sum(float(mass.kg) for mass in rig.masses) or np.inf)
         if kg.min(initial=0.0) < 0.0:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.rig.suspect import Suspect, listed
+from sensors.holds import spread_known
 from sensors.lidar import LARGEST_REFLECTANCE, LidarModel, beams
 from sensors.recording import RecordedStops, Scan
 from sensors.rings import RingFinding, odd_rings, ring_elevations
@@ -34,7 +35,7 @@ class ScanSums:
         intensity: scan -> its largest intensity, where it has any.
         darkest: the least intensity.
         doubled: scans of which a third of the points or more are there once more.
-        rounded: scans half of whose spreads are 0, see `Scan.spread_known`.
+        rounded: scans half of whose spreads are 0, see `spread_known`.
         reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
         contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
             "points" stands for x, y and z.
@@ -78,7 +79,7 @@ class ScanSums:
         if _alike(np.column_stack([scan.xyz_m, scan.ring, sweep])) > DOUBLED:
             self.doubled.append(name)
         told = np.isfinite(scan.range_std_m) & (scan.count > 1)
-        if told.any() and not scan.spread_known.any():
+        if told.any() and not spread_known(scan.range_std_m, scan.count).any():
             self.rounded.append(name)
         for column, values in {
             "points": scan.xyz_m,

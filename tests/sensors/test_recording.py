@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from chains.errors import InputError
+from sensors.holds import spread_known
 from sensors.recording import RecordedStops, read_table, write_table
 
 JOINTS = ("shoulder", "slide")
@@ -201,7 +202,8 @@ def test_an_averaged_scan_is_read_as_written(write):
 )
 def test_which_spreads_say_how_far_sweeps_scatter(write, spread_m, count, known):
     columns = cloud(count=np.array(count), range_std_m=np.array(spread_m))
-    assert open_cart(write(scans={"a": columns})).scan(0).spread_known.tolist() == known
+    scan = open_cart(write(scans={"a": columns})).scan(0)
+    assert spread_known(scan.range_std_m, scan.count).tolist() == known
 
 
 def test_what_a_scan_does_not_say_is_unknown_and_no_returns_are_left_out(write):
