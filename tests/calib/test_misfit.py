@@ -23,10 +23,11 @@ from calib.results.misfit import (
 )
 from calib.runs.calibrate import calibrate
 from calib.show.comparison import print_comparison
+from calib.show.misfit import misfit_warnings
 from calib.solve.components.checks import Checks
 from calib.solve.fit import solve
 
-from . import broken, rigs
+from . import arm_worlds, broken, rigs
 
 SMALL = Model(("arm_joint_offset", "ring_range_offset"))
 
@@ -108,6 +109,19 @@ def test_one_wild_row_widens_no_sigma_and_a_wrong_sigma_all_of_them(tmp_path, sh
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
     run = calibrate([folder], tmp_path / "again", hold_out="none")
     assert 2 < run.summary["sigmas_widened_by"] < 6
+
+
+@pytest.mark.parametrize(("sigma_joint_rad", "told"), [(2e-5, False), (2e-3, True)])
+def test_a_sigma_that_is_far_too_large_is_told(tmp_path, sigma_joint_rad, told):
+    """Encoders are a hundred times as good as rig.yaml says: all is better known than it seems."""
+    rng = np.random.default_rng(3)
+    world = arm_worlds.bent(tmp_path / "rec", "puma560", rng)
+    read = world.draw(rng, 80)
+    T = world.seen(read) * arm_worlds.exp(arm_worlds.noise(rng, 80))
+    arm_worlds.save(tmp_path / "rec", world, read, T, {}, sigma_joint_rad)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
+    said = " ".join(misfit_warnings(run.summary))
+    assert ("times smaller than expected: a sigma in rig.yaml is too large" in said) is told
 
 
 def of_cad(run):

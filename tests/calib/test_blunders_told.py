@@ -1,0 +1,42 @@
+"""How blunders are told."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from calib.blunders import judged, told
+from calib.blunders.shifts import Shift
+from calib.residuals.groups import Group
+
+
+@pytest.mark.parametrize(("along", "words"), [(20.0, "mm off in x"), (0.5, "none of which is")])
+def test_a_blunder_of_which_no_part_is_known_is_told_without_a_size(along, words):
+    """Its shift and its turn together are far out; how large either is, nothing tells."""
+    sigma = np.array([1e-3, 1e-3])
+    covariance = np.outer(sigma, sigma) * np.array([[1.0, 0.9999], [0.9999, 1.0]])
+    offset = along * sigma * np.array([1.0, -1.0 if along < 1 else 0.01])
+    shift = Shift(
+        group=Group("body", "s1", "base_markers"),
+        statistic=float(offset @ np.linalg.solve(covariance, offset)),
+        dof=2,
+        offset=offset,
+        covariance=covariance,
+        information=np.linalg.inv(covariance),
+        axes=("x", "rx"),
+        units=("m", "rad"),
+    )
+    assert shift.statistic > 400
+    blunder = judged.Blunder(
+        shift=shift,
+        p_value=1e-6,
+        p_adjusted=1e-6,
+        evidence=50.0,
+        limit=20.0,
+        enough=30.0,
+        detectable={},
+        looks=10,
+    )
+    source = SimpleNamespace(rig=SimpleNamespace(tree=None), reference=None)
+    found = told.document(judged.LeftOut(blunder, rivals=[]), [source])
+    assert words in found["sentence"] and "against everything else" in found["sentence"]
