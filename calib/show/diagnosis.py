@@ -30,6 +30,11 @@ if TYPE_CHECKING:
     from calib.runs.explain import Explanation
     from calib.runs.run import Run
 
+# Before the command that leaves out what is wrong. A blunder may be two columns or rows that are
+# exchanged, which that looks for.
+LEAVE_OUT = (
+    "Correct the recording ('rigcal check' tells what seems mixed up in it), or leave this out:"
+)
 LEADING = 8  # candidates that are shown; diagnosis.json has all
 WEAKEST = 4  # directions that are shown
 
@@ -113,8 +118,8 @@ def _say_found(console: Console, diagnosis: Diagnosis) -> None:
         console.print(sentence)
     console.print()
     if diagnosis.command:
-        what = {"what": "Add it to the model:"} if diagnosis.formulas else {}
-        print_command(console, diagnosis.command, **what)
+        what = "Add it to the model:" if diagnosis.formulas else LEAVE_OUT
+        print_command(console, diagnosis.command, what)
 
 
 def candidates_table(candidates: Sequence[Mapping[str, Any]], residual: str) -> Table:
