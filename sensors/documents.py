@@ -20,7 +20,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import pydantic
 import yaml
-from pydantic_core import to_json
+from pydantic_core import PydanticSerializationError, to_json
 from yaml import composer, constructor, resolver
 
 from chains import escape
@@ -377,8 +377,12 @@ def write_json(path: str | Path, data: Any) -> None:
 
 def json_text(data: Any) -> str:
     """The data as a JSON document; a number that is not finite becomes null."""
-    text = to_json(data, indent=1, inf_nan_mode="null", fallback=plain)
-    return escape.json(text.decode("utf-8"))
+    try:
+        text = to_json(data, indent=1, inf_nan_mode="null", fallback=plain).decode("utf-8")
+    except PydanticSerializationError:  # names of files that are no UTF-8
+        finite = json.loads(json.dumps(plain(data)), parse_constant=lambda _: None)
+        text = json.dumps(finite, indent=1, ensure_ascii=False)
+    return escape.json(text)
 
 
 def plain(data: Any) -> Any:

@@ -14,11 +14,13 @@ FLOOR_M = 0.012
 """Three range steps of the coarsest sensor: below this nothing is an outlier."""
 
 
-def spread_known(range_std_m: NDArray, count: NDArray) -> NDArray[np.bool_]:
-    """Whether spreads (N,) say how far the sweeps (N,) that were averaged into a point scatter.
-    Where half of them are 0 none does: nothing was recorded, or ranges are rounded to more than
-    they scatter."""
-    known = np.isfinite(range_std_m) & (count > 1)
+def spread_known(
+    range_std_m: NDArray, count: NDArray, among: NDArray[np.bool_] | bool = True
+) -> NDArray[np.bool_]:
+    """Which spreads (N,), `among` some or all, say how far the sweeps (N,) that were averaged into
+    a point scatter. Where more than half of these are 0 none does: nothing was recorded, or ranges
+    are rounded to more than they scatter."""
+    known = np.isfinite(range_std_m) & (count > 1) & among
     return known & bool(known.any() and np.median(range_std_m[known]) > 0.0)
 
 

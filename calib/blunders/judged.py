@@ -34,6 +34,7 @@ STATED = 8.0
 LIKELY = ("body", "scan", "target", "level", "frame", "surface", "joints", "rings")
 # Beyond this what a joint does is far from its derivative: no joint is said to be so far off.
 LINEAR_RAD = 0.5
+TELLING = 2.0  # sigmas: by convention, from which a size says something
 ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
 
 
@@ -101,6 +102,10 @@ class Blunder:
             sigma = float(np.sqrt(offset @ covariance @ offset)) / size
             k = int(np.argmax(np.abs(offset)))
             axis = shift.axes[at[k]] if abs(offset[k]) > ALONG * size else ""
+            if size < TELLING * sigma:  # as a whole nothing tells it: then what is known best
+                known = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+                k = int(np.argmax(np.abs(offset) / known))
+                size, sigma, axis = abs(float(offset[k])), float(known[k]), shift.axes[at[k]]
             best = max(best, (size / max(sigma, 1e-300), size, sigma, unit, axis))
         return best[1:]
 

@@ -16,6 +16,7 @@ from calib.linear.clusters import Entries, over_all
 from calib.linear.layout import positions
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
+from calib.residuals.groups import Group
 from calib.solve.graph import Graph
 
 # Of I - w H: below this a direction is held by the group alone (rounding of C is some 1e-9 of it).
@@ -50,6 +51,15 @@ class Alike(NamedTuple):
     rows: Sequence[GroupRows]
     left: np.ndarray
     b: np.ndarray
+
+    def groups(self) -> Iterator[tuple[Group, ...]]:
+        """Groups (K,) that have the same directions in their rows, one of each place."""
+        return zip(*(rows.groups for rows in self.rows), strict=True)
+
+    def size(self, own: np.ndarray) -> np.ndarray:
+        """Root (K, r) of what the rows say of offsets in directions (m, r), all else known."""
+        raw = np.stack([rows.own_information for rows in self.rows])
+        return np.sqrt(np.maximum(np.einsum("ir,kij,jr->kr", own, raw, own), 1e-300))
 
 
 @dataclass(frozen=True)

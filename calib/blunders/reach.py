@@ -104,11 +104,9 @@ def _estimates(others: Others, sigma: Mapping[str, float]) -> tuple[list[str], n
 def _moved(some: Alike) -> Iterator[tuple[Group, bool, np.ndarray]]:
     """Groups, whether it is their range zero that is off, and by how much an offset of one squared
     sigma in the test moves each estimate (P,) at most; `some` have these columns of C."""
-    raw = np.stack([rows.own_information for rows in some.rows])
-    for names in zip(*(rows.groups for rows in some.rows), strict=True):
+    for names in some.groups():
         own = some.rows[0].groups[names[0]]
-        size = np.sqrt(np.maximum(np.einsum("ir,kij,jr->kr", own, raw, own), 1e-300))
-        whiten, _ = whitening(own.T @ some.left @ own, size)
+        whiten, _ = whitening(own.T @ some.left @ own, some.size(own))
         moved = np.linalg.norm(whiten.mT @ own.T @ some.b, axis=1)
         for rows, group, each in zip(some.rows, names, moved, strict=True):
             yield group, rows.of_ranges, each

@@ -53,6 +53,7 @@ class Shift:
         axes: (q,) names of the directions.
         units: (q,) "m" or "rad" each.
         squares: unit -> sum of squares of its whitened rows, and of their redundancies; of rows.
+        turn: (q, q) from the rows' own axes to these, where they differ.
     """
 
     group: Group
@@ -64,6 +65,7 @@ class Shift:
     axes: tuple[str, ...]
     units: tuple[str, ...]
     squares: Squares = field(default_factory=dict)
+    turn: np.ndarray | None = None
 
     @property
     def of_ranges(self) -> bool:
@@ -89,7 +91,7 @@ def shifts(others: Others) -> list[Shift]:
     for some in others.alike():
         summed = some.rows[0].information is not None
         squares = [{}] * len(some.rows) if summed else list(_squares(some))
-        for groups in zip(*(rows.groups for rows in some.rows), strict=True):
+        for groups in some.groups():
             every = (_of_sums if summed else _of_rows)(some, groups, squares)
             for number, shift in zip(some.number, every, strict=True):
                 found.setdefault(number, []).append(shift)
@@ -210,10 +212,8 @@ def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
     """The score tests of shifts that some rows of each stop alone have."""
     first = some.rows[0]
     own = first.groups[groups[0]]
-    raw = np.stack([rows.information for rows in some.rows])
     left, score = own.T @ some.left @ own, some.b @ own
-    size = np.sqrt(np.maximum(np.einsum("ir,kij,jr->kr", own, raw, own), 1e-300))
-    whiten, dof = whitening(left, size)
+    whiten, dof = whitening(left, some.size(own))
     score = np.vecmat(score, whiten)
     offset, covariance = np.matvec(whiten, score), whiten @ whiten.mT
     held = dof < left.shape[1]
@@ -262,6 +262,7 @@ def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
             axes=along_which,
             units=units,
             squares=squares[k],
+            turn=some.rows[k].turn if len(at) == len(first.axes) else None,
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders.chance import LEAST_P, at_least
-from calib.blunders.judged import Blunder, LeftOut
+from calib.blunders.judged import TELLING, Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
 from calib.problem.model import Source, labels, same_mesh
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
@@ -20,7 +20,6 @@ SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
 LARGE_SIZE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
 # Where an angle of an arm is not as drawn: a choice, ten times what arms are off by at most.
 DRAWN_OTHERWISE_RAD = 0.5
-TELLING = 2.0  # sigmas: by convention, from which a size says something
 SIGN = 0.05  # of twice a value on paper, within which it is off as a wrong sign would have it
 
 
@@ -265,7 +264,8 @@ def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
     group = f"T{group[1:]}" if group.startswith("the ") else group
     verb = "are" if left.blunder.group.what == JOINTS else "is"
     off = f"{size_told(*size)} off{along}, against everything else"
-    if size[0] < TELLING * size[1]:
+    shift = left.blunder.shift
+    if np.all(np.abs(shift.offset) < TELLING * np.sqrt(np.diag(shift.covariance))):
         off = (
             "off in several directions together, none of which is known by itself, against "
             "everything else"

@@ -143,8 +143,8 @@ class StopPoseScatter(Scatter):
 
 
 class TrackerScatter(Scatter):
-    """The tracker scatters more than rig.yaml says: from stop to stop, in turn or in place, by
-    glints, cameras that were bumped, markers that are hidden one by one."""
+    """The tracker scatters more than rig.yaml says: from stop to stop, in how bodies are turned or
+    where they are, by glints, cameras that were bumped, markers that are hidden one by one."""
 
     name = "tracker_scatter"
     site = Site.TRACKER

@@ -368,7 +368,7 @@ class ScanStop:
         were `PRIOR_COUNT` sweeps more: a spread of few sweeps is itself too uncertain a weight.
         """
         measured = np.square(scan.range_std_m)
-        known = spread_known(scan.range_std_m, scan.count) & usable
+        known = spread_known(scan.range_std_m, scan.count, usable)
         if known.any():
             single = single * np.median((measured / single)[known])
             dof = np.where(known, scan.count - 1.0, 0.0)

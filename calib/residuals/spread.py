@@ -48,7 +48,7 @@ def spread_rows(
         usable: (N,) whether a beam met anything.
         growth: variable -> (N, P) of log sigma, per unit.
     """
-    known = spread_known(scan.range_std_m, scan.count) & usable
+    known = spread_known(scan.range_std_m, scan.count, usable)
     if not growth or known.sum() < 2:
         return None
     dof = np.where(known, scan.count - 1.0, 0.0)

@@ -165,7 +165,9 @@ def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
         if name not in recording.covariates:
             continue
         kg = np.nan_to_num(recording.covariates[name])
-        most = min(HEAVIEST_LOAD_KG, sum(float(mass.kg) for mass in rig.masses) or np.inf)
+        weighs_kg = sum(float(mass.kg) for mass in rig.masses)
+        credible = weighs_kg > 0 and not list(_odd_masses(rig))
+        most = min(HEAVIEST_LOAD_KG, weighs_kg) if credible else HEAVIEST_LOAD_KG
         if kg.min(initial=0.0) < 0.0:
             yield f"{name} goes down to {kg.min():g} in stops.csv; a load is not below 0"
         elif kg.max(initial=0.0) > most:

@@ -17,7 +17,7 @@ from sensors.rings import RingFinding, odd_rings, ring_elevations
 
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
 DOUBLED = 1 / 3  # a choice: of points by chance none repeats another; of a copy half do
-PRIMES = (2, 3, 5, 7, 11)  # by whose roots columns are added up: no two rows come to one number
+PRIMES = (2, 3, 5, 7)  # by whose roots columns are added up: no two rows come to one number
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
 
 
@@ -34,8 +34,8 @@ class ScanSums:
         columns: names of the per-point covariates.
         intensity: scan -> its largest intensity, where it has any.
         darkest: the least intensity.
-        doubled: scans of which a third of the points or more are there once more.
-        rounded: scans half of whose spreads are 0, see `spread_known`.
+        doubled: scans of which more than a third of the points are there once more.
+        rounded: scans more than half of whose spreads are 0, see `spread_known`.
         reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
         contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
             "points" stands for x, y and z.
@@ -75,8 +75,7 @@ class ScanSums:
         if np.isfinite(scan.intensity).any():
             self.intensity[name] = float(np.nanmax(scan.intensity))
             self.darkest = min(self.darkest, float(np.nanmin(scan.intensity)))
-        sweep = scan.extra.get("scan", np.zeros(len(scan.ring)))  # of raw scans
-        if _alike(np.column_stack([scan.xyz_m, scan.ring, sweep])) > DOUBLED:
+        if _alike(np.column_stack([scan.xyz_m, scan.ring])) > DOUBLED:
             self.doubled.append(name)
         told = np.isfinite(scan.range_std_m) & (scan.count > 1)
         if told.any() and not spread_known(scan.range_std_m, scan.count).any():
@@ -138,7 +137,7 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
         )
     if scans.rounded:
         yield (
-            f"half of range_std_m or more is 0 at {listed(scans.rounded)}, so it is not used "
+            f"more than half of range_std_m is 0 at {listed(scans.rounded)}, so it is not used "
             "there; leave it empty where it is unknown"
         )
     yield from _at_once(recording)

@@ -86,10 +86,11 @@ def misfit_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
         )
     held_out, expected = (summary["rms_mm"].get(key) for key in ("held_out", "noise_floor"))
     if held_out and expected and expected > FAR_LESS * held_out:
+        lidar = ", or that of the LiDAR's model" if summary["residual"] == "range" else ""
         yield (
             f"the held-out error is {times(expected / held_out)} times smaller than expected: a "
-            "sigma in rig.yaml is too large (tracker, joints, targets or reference), and so are "
-            "those above that rest on it"
+            f"sigma in rig.yaml is too large (tracker, joints, targets or reference){lidar}, and "
+            "so are those above that rest on it"
         )
     for told in together_told(summary):
         yield f"{told}; 'rigcal diagnose' looks for the cause"

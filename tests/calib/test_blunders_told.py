@@ -10,12 +10,19 @@ from calib.blunders.shifts import Shift
 from calib.residuals.groups import Group
 
 
-@pytest.mark.parametrize(("along", "words"), [(20.0, "mm off in x"), (0.5, "none of which is")])
+@pytest.mark.parametrize(
+    ("along", "words"),
+    [(20.0, "mm off in x"), (0.5, "none of which is"), (0.0, "0.1 ± 0.001 mm off in x")],
+)
 def test_a_blunder_of_which_no_part_is_known_is_told_without_a_size(along, words):
     """Its shift and its turn together are far out; how large either is, nothing tells."""
     sigma = np.array([1e-3, 1e-3])
     covariance = np.outer(sigma, sigma) * np.array([[1.0, 0.9999], [0.9999, 1.0]])
     offset = along * sigma * np.array([1.0, -1.0 if along < 1 else 0.01])
+    units = ("m", "rad")
+    if not along:  # one axis is known well, another is not
+        offset, units = np.array([1e-4, 5e-3]), ("m", "m")
+        covariance = np.diag([1e-6, 4.4e-3]) ** 2
     shift = Shift(
         group=Group("body", "s1", "base_markers"),
         statistic=float(offset @ np.linalg.solve(covariance, offset)),
@@ -24,7 +31,7 @@ def test_a_blunder_of_which_no_part_is_known_is_told_without_a_size(along, words
         covariance=covariance,
         information=np.linalg.inv(covariance),
         axes=("x", "rx"),
-        units=("m", "rad"),
+        units=units,
     )
     assert shift.statistic > 400
     blunder = judged.Blunder(

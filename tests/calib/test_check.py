@@ -266,9 +266,10 @@ def test_targets_that_are_mixed_up(rec):
     assert any(line.startswith("tracker and scanner place t") for line in odd), odd
 
 
-def test_payloads_that_no_arm_carries():
-    def odd(*kg, masses=(10.0, 8.0)):
-        """What is said of loads on an arm whose links weigh so much."""
+def test_payloads_that_no_arm_carries(monkeypatch):
+    def odd(*kg, masses=(10.0, 8.0), doubts=()):
+        """What is said of loads on an arm whose links weigh so much, or are said to."""
+        monkeypatch.setattr("calib.rig.inventory._odd_masses", lambda rig: iter(doubts))
         rig = SimpleNamespace(tips=["flange"], masses=[SimpleNamespace(kg=m) for m in masses])
         columns = {"payload_kg": np.array(kg), "temperature_c": np.full(len(kg), -300.0)}
         return list(odd_payloads(rig, SimpleNamespace(covariates=columns)))
@@ -277,6 +278,7 @@ def test_payloads_that_no_arm_carries():
     (said,) = odd(0.0, 2500.0)
     assert "payload_kg goes up to 2500" in said and "(18 kg)" in said and "in grams?" in said
     assert "in grams?" in odd(5000.0, masses=())[0]
+    assert odd(10.0, masses=(1.0,) * 6, doubts=["all weigh 1 kg; are these measured?"]) == []
     (said,) = odd(0.0, -2.5)
     assert "down to -2.5" in said
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib.diagnosis.chance.in_turn import FEWEST_IN_TURN, p_in_turn
 from calib.diagnosis.search import search
@@ -22,8 +23,9 @@ def quiet(*told):
     """Nothing."""
 
 
-def told(errors, time_s=None, effect="tracker_scatter"):
-    """The p-value for errors (K, r) of a body at the stops of a table, with the times of these."""
+def told(errors, time_s=None, effect="tracker_scatter", turn=None):
+    """The p-value for errors (K, r) of a body at the stops of a table, with the times of these; and
+    what turns (K, r, r) the rows' own axes to theirs."""
     stops = STOPS[: len(errors)]
     timed = np.full(len(stops), time_s is not None)
     recording = SimpleNamespace(stops=stops, timed=timed, time_s=time_s)
@@ -39,9 +41,10 @@ def told(errors, time_s=None, effect="tracker_scatter"):
                 dof=errors.shape[1],
                 offset=error,
                 covariance=known,
+                turn=None if turn is None else turn[k],
             ),
         )
-        for stop, error in zip(stops, errors, strict=True)
+        for k, (stop, error) in enumerate(zip(stops, errors, strict=True))
     ]
     return p_in_turn(find(effect), others, blunders)
 
@@ -71,6 +74,20 @@ def test_what_drifts_and_what_was_changed_for_a_while_goes_in_turn():
         order = rng.permutation(30)
         assert told(errors[order]) > 0.01  # as a table has them
         assert told(errors[order], time_s=60.0 * order) == pytest.approx(told(errors))
+
+
+def test_what_is_fixed_to_a_body_and_what_is_fixed_to_the_tracker_go_in_turn():
+    """A body that is turned otherwise at every stop sits elsewhere on ten of thirty; or the tracker
+    sees it elsewhere then."""
+    rng, k = np.random.default_rng(2), np.arange(30)
+    course = np.where((k >= 10) & (k < 20), 6.0, -3.0)[:, None] * np.array([1.0, -0.5, 0.3])
+    turn = Rotation.random(30, rng).as_matrix()
+    noise = rng.normal(size=(30, 3))
+    assert told(np.matvec(turn, course) + noise) > 0.01
+    assert told(np.matvec(turn, course) + noise, turn=turn) < 0.01
+    assert told(course + noise, turn=turn) < 0.01
+    random = [told(rng.normal(size=(30, 3)), turn=turn) for _ in range(300)]
+    assert np.mean(np.array(random) < 0.05) < 0.08
 
 
 def test_few_stops_and_other_instruments_tell_nothing():
@@ -103,23 +120,48 @@ def test_values_of_stops_are_taken_as_the_stops_were_made():
             [SimpleNamespace(effect=effect.among(members, f"{day}/"), variable="v")]
             for day in ("mon", "tue")
         ]
+        variables = {"v": SimpleNamespace(sigma=np.full(60, 2.0))}
         others = SimpleNamespace(
-            problem=SimpleNamespace(sources=both, terms=terms),
+            problem=SimpleNamespace(sources=both, terms=terms, variables=variables),
             whole=SimpleNamespace(values={"v": np.concatenate([values, rng.permutation(drift)])}),
         )
         assert (p_in_turn(effect, others, []) < 0.01) is alike
 
 
-@pytest.mark.parametrize("random", [True, False])
-def test_a_body_that_sat_elsewhere_for_a_while_is_not_called_random(tmp_path, random):
-    """It is turned for a third of the poses, and back; or for as many, here and there."""
+def test_turns_do_not_hide_shifts_in_another_unit():
+    """Of values that turn at random by 5 mrad and shift by up to 1 mm, steadily."""
+    rng, k = np.random.default_rng(8), np.arange(30)
+    found = []
+    for steady in (True, False):
+        shift_m = np.outer(1e-3 * (k - 14.5) / 15, [1.0, 0.5, -0.5])
+        shift_m = shift_m if steady else rng.permutation(shift_m)
+        values = np.hstack([5e-3 * rng.normal(size=(30, 3)), shift_m])
+        recording = SimpleNamespace(stops=STOPS[:30], timed=np.zeros(30, bool))
+        effect = find("stop_pose_scatter").among(STOPS[:30])
+        sd = np.tile(np.repeat([5e-3, 6e-4], 3), 30)
+        others = SimpleNamespace(
+            problem=SimpleNamespace(
+                sources=[SimpleNamespace(recording=recording)],
+                terms=[[SimpleNamespace(effect=effect, variable="v")]],
+                variables={"v": SimpleNamespace(sigma=sd)},
+            ),
+            whole=SimpleNamespace(values={"v": values.ravel()}),
+        )
+        found.append(p_in_turn(effect, others, []))
+    assert found[0] < 0.01 < found[1]
+
+
+@pytest.mark.parametrize(("random", "pure_shift"), [(True, True), (False, True), (False, False)])
+def test_a_body_that_sat_elsewhere_for_a_while_is_not_called_random(tmp_path, random, pure_shift):
+    """It is elsewhere for half of the poses, fifteen at a time; or for as many, here and there."""
     rng = np.random.default_rng(77)
     world = arm_worlds.bent(tmp_path / "rec", "puma560", rng)
     read = world.draw(rng, 90)
     away = (np.arange(90) // 15) % 2 == 1
     if random:
         away = rng.permutation(away)
-    twist = np.outer(away - 0.5, [4e-3, -3e-3, 2e-3, 3e-4, 2e-4, -3e-4])
+    by = [0.0, 0.0, 0.0, 6e-4, 4e-4, -6e-4] if pure_shift else [4e-3, -3e-3, 2e-3, 0.0, 0.0, 0.0]
+    twist = np.outer(away - 0.5, by)
     T = world.seen(read) * arm_worlds.exp(twist) * arm_worlds.exp(arm_worlds.noise(rng, 90))
     arm_worlds.save(tmp_path / "rec", world, read, T, {}, 2e-5)
     run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")

@@ -1,6 +1,7 @@
 """Documents: what YAML 1.2 says is read, what is wrong is named, what is written is whole."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from sensors.documents import (
     Document,
     Number,
     Triple,
+    json_text,
     read_yaml,
     validate,
     write_atomically,
@@ -145,6 +147,13 @@ def test_what_is_written_is_read_back(tmp_path):
     assert back["texts"] == data["texts"] and back["nothing"] is None
     assert back["deep"] == [{"a": [1, 2]}, {"b": str(tmp_path)}]
     assert "list: [0.1, -2.0e-07, 1.0e+22]" in (tmp_path / "a.yaml").read_text()
+
+
+def test_names_that_are_no_utf_8_are_escaped():
+    """As of a folder from another machine: JSON cannot hold what stands for such a byte."""
+    text = json_text({"\udcff": [np.nan, np.float64(1.5), Path("a/\udcff")]})
+    assert json.loads(text) == {"\udcff": [None, 1.5, "a/\udcff"]}
+    text.encode("utf-8")
 
 
 def test_json_has_null_where_a_number_is_not_finite(tmp_path):

@@ -204,6 +204,9 @@ def test_which_spreads_say_how_far_sweeps_scatter(write, spread_m, count, known)
     columns = cloud(count=np.array(count), range_std_m=np.array(spread_m))
     scan = open_cart(write(scans={"a": columns})).scan(0)
     assert spread_known(scan.range_std_m, scan.count).tolist() == known
+    first = np.arange(3) == 0  # alone, a spread of 0 tells nothing
+    alone = known[0] and spread_m[0] > 0
+    assert spread_known(scan.range_std_m, scan.count, first).tolist() == [alone, False, False]
 
 
 def test_what_a_scan_does_not_say_is_unknown_and_no_returns_are_left_out(write):

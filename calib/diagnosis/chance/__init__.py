@@ -200,8 +200,9 @@ class Chance:
         how = f"random as far as these data show (p = {self.p_adjusted:.1g})"
         if self.p_in_turn < ALPHA_IN_TURN:
             how = (
-                f"not at random, as stops that follow each other err alike (p = "
-                f"{at_least(self.p_in_turn):.1g}): something drifts, or was changed in between"
+                "not at random, as stops that follow each other err alike (p = "
+                f"{at_least(self.p_in_turn):.1g}): something drifts, was changed in between, or "
+                "goes with the pose where poses follow a path"
             )
         return (
             f"{what}; {how}. {rivals}"

@@ -4,7 +4,9 @@ alike, as where something drifts, or was changed in between and changed back.
 With r_k the errors of the k-th stop in time, ``S = sum r_k . r_(k+1)``. Where errors are random,
 each might as well have the other sign, and then S has the mean 0 and the variance ``sum (r_k .
 r_(k+1))^2``, however widely any of them scatters (the serial correlation of von Neumann 1941, by
-signs as in `jackknife`).
+signs as in `jackknife`). Errors are taken against a fit of all other rows, which leaves next to
+nothing in common between those of neighbours. What is fixed to a body keeps its direction in the
+body's axes, and what is fixed to the tracker keeps it in the tracker's: both are asked.
 """
 
 from __future__ import annotations
@@ -58,14 +60,18 @@ def _in_time(source: Source) -> list[str]:
 def _of_rows(
     kind: str, blunders: list[Blunder], turn: dict[tuple[str, str], int]
 ) -> Iterator[np.ndarray]:
-    """Errors (K, r) of each body, or each joint, in its sigmas, in the order of time."""
-    found: dict[tuple[str, str, int], list[tuple[int, np.ndarray]]] = {}
+    """Errors (K, r) of each body, or each joint, in its sigmas, in the order of time; of bodies in
+    the axes in which people are told, and in those of the rows."""
+    found: dict[tuple[str, str, int, bool], list[tuple[int, np.ndarray]]] = {}
     for shift in (b.shift for b in blunders if b.group.kind == kind and not b.found):
         at = turn.get((shift.group.recording, shift.group.where))
         if at is not None and shift.dof == len(shift.offset):
-            key = shift.group.recording, shift.group.what, shift.dof
-            error = shift.offset / np.sqrt(np.diag(shift.covariance))
-            found.setdefault(key, []).append((at, error))
+            for R in (None,) if shift.turn is None else (None, shift.turn):
+                offset, C = shift.offset, shift.covariance
+                if R is not None:
+                    offset, C = R.T @ offset, R.T @ C @ R
+                key = shift.group.recording, shift.group.what, shift.dof, R is None
+                found.setdefault(key, []).append((at, offset / np.sqrt(np.diag(C))))
     for some in found.values():
         yield np.stack([error for _, error in sorted(some, key=lambda each: each[0])])
 
@@ -73,14 +79,15 @@ def _of_rows(
 def _of_values(
     effect: Scatter, others: Others, turn: dict[tuple[str, str], int]
 ) -> Iterator[np.ndarray]:
-    """Values (K, r) of the stops of each recording, in the order of time."""
+    """Values (K, r) of the stops of each recording, in their spreads, in the order of time."""
     named = zip(others.problem.terms, labels(others.problem.sources), strict=True)
     for term, label in ((t, label) for some, label in named for t in some):
         if term.effect.name == effect.name:
             known = {
                 f"{term.effect.label}{stop}": at for (of, stop), at in turn.items() if of == label
             }
-            values = others.whole.values[term.variable].reshape(len(term.effect.members), -1)
+            sd = others.problem.variables[term.variable].sigma
+            values = (others.whole.values[term.variable] / sd).reshape(len(term.effect.members), -1)
             mine = [k for k, member in enumerate(term.effect.members) if member in known]
             yield values[sorted(mine, key=lambda k: known[term.effect.members[k]])]
 
