@@ -218,20 +218,8 @@ def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
     offset, covariance = np.matvec(whiten, score), whiten @ whiten.mT
     held = dof < left.shape[1]
     left[held] = 0.0
-    at = np.argmax(own, axis=0)
-    axes, units = (tuple(each[i] for i in at) for each in (first.axes, first.units))
-    for k, group in enumerate(groups):
-        yield Shift(
-            group=group,
-            statistic=float(score[k] @ score[k]),
-            dof=int(dof[k]),
-            offset=offset[k],
-            covariance=covariance[k],
-            information=left[k],
-            axes=axes,
-            units=units,
-            squares=squares[k],
-        )
+    found = np.square(score).sum(axis=1), dof, offset, covariance, left
+    return _told(some, groups, np.argmax(own, axis=0), squares, found)
 
 
 def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -> Iterator[Shift]:
@@ -250,19 +238,34 @@ def _of_rows(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -
     statistic = np.sum(values * np.square(along), axis=1)
     offset, covariance = -np.matvec(out, along), (out * over[:, None]) @ out.mT
     information = (told * values[:, None]) @ told.mT
-    along_which, units = (tuple(each[i] for i in at) for each in (first.axes, first.units))
-    for k, group in enumerate(groups):
+    found = statistic, seen.sum(axis=1), offset, covariance, information
+    return _told(some, groups, at, squares, found)
+
+
+def _told(
+    some: Alike,
+    groups: Sequence[Group],
+    at: np.ndarray,
+    squares: Sequence[Squares],
+    found: Sequence[np.ndarray],
+) -> Iterator[Shift]:
+    """The shifts of groups (K,) along rows (q,): what was found are statistics and dofs (K,),
+    offsets (K, q), their covariances and informations (K, q, q)."""
+    first = some.rows[0]
+    axes, units = (tuple(each[i] for i in at) for each in (first.axes, first.units))
+    every = zip(some.rows, groups, squares, *found, strict=True)
+    for rows, group, its_squares, statistic, dof, offset, covariance, information in every:
         yield Shift(
             group=group,
-            statistic=float(statistic[k]),
-            dof=int(seen[k].sum()),
-            offset=offset[k],
-            covariance=covariance[k],
-            information=information[k],
-            axes=along_which,
+            statistic=float(statistic),
+            dof=int(dof),
+            offset=offset,
+            covariance=covariance,
+            information=information,
+            axes=axes,
             units=units,
-            squares=squares[k],
-            turn=some.rows[k].turn if len(at) == len(first.axes) else None,
+            squares=its_squares,
+            turn=rows.turn if len(at) == len(first.axes) else None,
         )
 
 

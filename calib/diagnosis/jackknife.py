@@ -140,7 +140,7 @@ def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpr
     """
     by_stop, *others = (_evenly(shares) for shares in ways)
     more = _beyond(*others) if others else np.zeros_like(by_stop)
-    count = max(min([stops, *(len(shares) for shares in ways[1:2])]), 1)
+    count = max(min([stops, *map(len, ways[1:2])]), 1)
     nu = _freedom(ways[0], count)
     if np.trace(more) > 0.0:
         nu = min(nu, _freedom(ways[1], len(ways[1])))

@@ -15,7 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.diagnosis.candidates import covariates, finer, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
-from calib.diagnosis.chance.in_turn import p_in_turn
+from calib.diagnosis.chance.serial import p_serial
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
@@ -261,7 +261,7 @@ class Look:
         all else in it."""
         beside = (chance.beside(self.stand.estimate) for chance in some)
         return [
-            replace(c, p_in_turn=p_in_turn(c.effect, self.others, self.blunders))
+            replace(c, p_serial=p_serial(c.effect, self.others, self.blunders))
             for c in beside
             if c.found
         ]

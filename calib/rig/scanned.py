@@ -77,8 +77,8 @@ class ScanSums:
             self.darkest = min(self.darkest, float(np.nanmin(scan.intensity)))
         if _alike(np.column_stack([scan.xyz_m, scan.ring])) > DOUBLED:
             self.doubled.append(name)
-        told = np.isfinite(scan.range_std_m) & (scan.count > 1)
-        if told.any() and not spread_known(scan.range_std_m, scan.count).any():
+        still = (scan.range_std_m == 0.0) & (scan.count > 1)
+        if still.any() and not spread_known(scan.range_std_m, scan.count).any():
             self.rounded.append(name)
         for column, values in {
             "points": scan.xyz_m,

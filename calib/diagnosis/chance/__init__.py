@@ -36,7 +36,7 @@ from calib.solve.components.told import LEAST_SD, Told, told
 from calib.solve.estimate import Estimate
 
 ALPHA_SCATTER = LEVELS["scatter by chance"]
-ALPHA_IN_TURN = 0.01  # so often what is random is said to go in turn: a choice, it names nothing
+ALPHA_SERIAL = 0.01  # share of random scatter that is said not to be: a choice, it names nothing
 # Members, or checks of a body's rows, below which nothing is said of their spread.
 FEWEST_MEMBERS = 4
 SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at
@@ -91,7 +91,7 @@ class Chance:
         p_value: how often as much is seen where there is none.
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
-        p_in_turn: how often chance makes stops that follow each other err so much alike.
+        p_serial: how often chance makes stops that follow each other err so much alike.
     """
 
     effect: Scatter
@@ -100,7 +100,7 @@ class Chance:
     p_value: float
     detectable: float
     rivals: Sequence[str] = ()
-    p_in_turn: float = 1.0
+    p_serial: float = 1.0
 
     @property
     def p_adjusted(self) -> float:
@@ -198,10 +198,10 @@ class Chance:
             else ""
         )
         how = f"random as far as these data show (p = {self.p_adjusted:.1g})"
-        if self.p_in_turn < ALPHA_IN_TURN:
+        if self.p_serial < ALPHA_SERIAL:
             how = (
                 "not at random, as stops that follow each other err alike (p = "
-                f"{at_least(self.p_in_turn):.1g}): something drifts, was changed in between, or "
+                f"{at_least(self.p_serial):.1g}): something drifts, was changed in between, or "
                 "goes with the pose where poses follow a path"
             )
         return (

@@ -1,5 +1,5 @@
-"""Whether what seems to scatter from stop to stop goes in turn: stops that follow each other err
-alike, as where something drifts, or was changed in between and changed back.
+"""Serial correlation of what seems to scatter from stop to stop: whether stops that follow each
+other err alike, as where something drifts, or was changed in between and changed back.
 
 With r_k the errors of the k-th stop in time, ``S = sum r_k . r_(k+1)``. Where errors are random,
 each might as well have the other sign, and then S has the mean 0 and the variance ``sum (r_k .
@@ -21,11 +21,11 @@ from calib.blunders.others import Others
 from calib.effects import Scatter, Site
 from calib.problem.model import Source, labels
 
-FEWEST_IN_TURN = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
+FEWEST_IN_SERIES = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
 OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
 
 
-def p_in_turn(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
+def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
     """How often chance makes errors that follow each other so much alike; 1 where nothing tells.
 
     Args:
@@ -33,18 +33,15 @@ def p_in_turn(effect: Scatter, others: Others, blunders: list[Blunder]) -> float
         others: all rows of the fit of that model.
         blunders: all groups of them, as `judge` has them.
     """
-    turn = {
-        (label, stop): at
-        for source, label in zip(
-            others.problem.sources, labels(others.problem.sources), strict=True
-        )
-        for at, stop in enumerate(_in_time(source))
-    }
+    sources = others.problem.sources
+    named = zip(sources, labels(sources), strict=True)
+    turn = {(of, stop): at for each, of in named for at, stop in enumerate(_in_time(each))}
+    series: Iterator[np.ndarray] = iter(())
     if effect.widens:
         series = _of_rows(OF_ROWS.get(effect.site, ""), blunders, turn)
-    else:
-        series = _of_values(effect, others, turn) if effect.per == "stop" else iter(())
-    p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_TURN]
+    elif effect.per == "stop":
+        series = _of_values(effect, others, turn)
+    p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_SERIES]
     return min(1.0, len(p) * min(p)) if p else 1.0
 
 

@@ -1,5 +1,5 @@
 """Errors of stops that follow each other: alike by chance as seldom as is said, and told where they
-go in turn."""
+are alike."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.diagnosis.chance.in_turn import FEWEST_IN_TURN, p_in_turn
+from calib.diagnosis.chance.serial import FEWEST_IN_SERIES, p_serial
 from calib.diagnosis.search import search
 from calib.effects import find
 from calib.runs.calibrate import calibrate
@@ -46,7 +46,7 @@ def told(errors, time_s=None, effect="tracker_scatter", turn=None):
         )
         for k, (stop, error) in enumerate(zip(stops, errors, strict=True))
     ]
-    return p_in_turn(find(effect), others, blunders)
+    return p_serial(find(effect), others, blunders)
 
 
 @pytest.mark.parametrize("count", [10, 20, 60])
@@ -64,7 +64,7 @@ def test_random_errors_are_seldom_alike(count, size):
     assert 0.4 < np.median(p) < 0.6
 
 
-def test_what_drifts_and_what_was_changed_for_a_while_goes_in_turn():
+def test_what_drifts_and_what_was_changed_for_a_while_is_correlated():
     rng, k = np.random.default_rng(0), np.arange(30)
     noise = rng.normal(size=(30, 6))
     along = rng.normal(size=6)
@@ -76,7 +76,7 @@ def test_what_drifts_and_what_was_changed_for_a_while_goes_in_turn():
         assert told(errors[order], time_s=60.0 * order) == pytest.approx(told(errors))
 
 
-def test_what_is_fixed_to_a_body_and_what_is_fixed_to_the_tracker_go_in_turn():
+def test_what_is_fixed_to_a_body_and_what_is_fixed_to_the_tracker_are_seen():
     """A body that is turned otherwise at every stop sits elsewhere on ten of thirty; or the tracker
     sees it elsewhere then."""
     rng, k = np.random.default_rng(2), np.arange(30)
@@ -91,7 +91,7 @@ def test_what_is_fixed_to_a_body_and_what_is_fixed_to_the_tracker_go_in_turn():
 
 
 def test_few_stops_and_other_instruments_tell_nothing():
-    drift = np.arange(FEWEST_IN_TURN - 1.0)[:, None] - 4.0
+    drift = np.arange(FEWEST_IN_SERIES - 1.0)[:, None] - 4.0
     assert told(drift) == 1.0
     drift = np.arange(30.0)[:, None] - 14.5
     assert told(drift) < 0.01
@@ -125,7 +125,7 @@ def test_values_of_stops_are_taken_as_the_stops_were_made():
             problem=SimpleNamespace(sources=both, terms=terms, variables=variables),
             whole=SimpleNamespace(values={"v": np.concatenate([values, rng.permutation(drift)])}),
         )
-        assert (p_in_turn(effect, others, []) < 0.01) is alike
+        assert (p_serial(effect, others, []) < 0.01) is alike
 
 
 def test_turns_do_not_hide_shifts_in_another_unit():
@@ -147,7 +147,7 @@ def test_turns_do_not_hide_shifts_in_another_unit():
             ),
             whole=SimpleNamespace(values={"v": values.ravel()}),
         )
-        found.append(p_in_turn(effect, others, []))
+        found.append(p_serial(effect, others, []))
     assert found[0] < 0.01 < found[1]
 
 
