@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import finite, nearest_times, step_times
+from calib.effects.basis import Creeps, Settles, Slips, finite
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
 from chains.minimal import Own, across, own_errors
@@ -61,7 +63,7 @@ class ArmJointOffset(Effect):
         return np.eye(len(view.rig.joint_names))[None]
 
 
-class ArmJointSlip(ArmJointOffset):
+class ArmJointSlip(Slips, ArmJointOffset):
     """A joint's zero changes once, and stays changed: a belt jumped, a clutch slipped, or the
     encoder was referenced anew."""
 
@@ -71,19 +73,30 @@ class ArmJointSlip(ArmJointOffset):
     covariates = ("joints", "elapsed_s")
     confounded_with = ("mount_slip", "base_slip", "arm_joint_offset")
     source = "size assumed"
-    shape_name, shape = "t_s", 900.0
-    jumps = True
     sigma = 0.001
 
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if self.params(stops.rig) else ()
-
-    def beside(self, stops: View) -> tuple[float, ...]:
-        return nearest_times(stops, self.shape) if self.params(stops.rig) else ()
-
     def basis(self, view: View) -> np.ndarray:
-        late = (view["elapsed_s"] > self.shape).astype(float)
-        return late[:, None, None] * super().basis(view)
+        return self.when(view["elapsed_s"])[:, None, None] * super().basis(view)
+
+
+class ArmJointCreep(Creeps, ArmJointSlip):
+    """A joint's zero drifts evenly in time, per hour: a belt stretches, or the joint still warms
+    up when the last stop is measured."""
+
+    name = "arm_joint_creep"
+    unit = "rad/h"
+    formula = "q_i = reported_i + offset_i * t / 1 h, t since the first stop"
+    typical = "0.05 to 1 mrad per hour, size assumed"
+    confounded_with = ("arm_joint_settle", "tracker_creep", "mount_creep")
+
+
+class ArmJointSettle(Settles, ArmJointSlip):
+    """A joint's zero drifts as the joint warms up: fast at first, then ever more slowly."""
+
+    name = "arm_joint_settle"
+    formula = "q_i = reported_i + offset_i * (1 - exp(-t / tau)), t since the first stop"
+    typical = "0.05 to 1 mrad, size assumed; gears warm up"
+    confounded_with = ("arm_joint_creep", "tracker_settle", "mount_settle")
 
 
 class ArmAxisTilt(Effect):
@@ -253,6 +266,26 @@ class ArmJointLag(ArmBacklash):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param(joint, "1", 0.0005) for joint in rig.joint_names)
+
+
+class ArmJointThermal(ArmJointOffset):
+    """A joint's zero goes with the temperature, as gear and housing grow unlike each other."""
+
+    name = "arm_joint_thermal"
+    unit = "rad/K"
+    formula = "q_i = reported_i + k_i * (temperature - 20 degrees C)"
+    typical = "0.01 to 0.1 mrad/K, size assumed"
+    covariates = ("joints", "temperature_c")
+    confounded_with = ("arm_thermal_growth", "arm_joint_creep", "arm_joint_offset")
+    source = "size assumed"
+    sigma = 0.0001
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(replace(p, unit=f"{p.unit}/K") for p in super().params(rig))
+
+    def basis(self, view: View) -> np.ndarray:
+        warmer = finite(view["temperature_c"] - AMBIENT_C)
+        return warmer[:, None, None] * super().basis(view)
 
 
 class ArmThermalGrowth(Effect):

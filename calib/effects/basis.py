@@ -1,10 +1,13 @@
-"""What bases are made of: columns kept finite, and put where they belong."""
+"""What bases are made of: columns kept finite and put where they belong, and courses in time."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from calib.effects.base import View
+from calib.effects.base import Effect, Param, View
+from calib.rig import Rig
 from sensors.lidar import GRAZING_RAD
 
 RANGE, AZIMUTH, ELEVATION = range(3)
@@ -64,3 +67,54 @@ def _between(stops: View) -> np.ndarray:
     """Times midway between stops, three or more of them on either side."""
     time_s = np.sort(stops["elapsed_s"])
     return (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+
+
+class Slips(Effect):
+    """What happens once, at a time t_s since the first stop, and then stays."""
+
+    shape_name, shape = "t_s", 900.0
+    jumps = True
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return step_times(stops) if self.params(stops.rig) else ()
+
+    def beside(self, stops: View) -> tuple[float, ...]:
+        return nearest_times(stops, self.shape) if self.params(stops.rig) else ()
+
+    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
+        """How much of it has happened (K,) at times since the first stop."""
+        return (elapsed_s > self.shape).astype(float)
+
+
+class Creeps(Effect):
+    """What happens little by little, evenly in time; per hour."""
+
+    shape_name, shape = "", 0.0
+    jumps = False
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return ()
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(replace(p, unit=f"{p.unit}/h") for p in super().params(rig))
+
+    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
+        """How much of it has happened (K,) at times since the first stop."""
+        return elapsed_s / 3600.0
+
+
+class Settles(Effect):
+    """What happens fast at first, then ever more slowly, with a time constant tau_s."""
+
+    shape_name, shape = "tau_s", 300.0
+    jumps = False
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Shares of the time measured in: after a longer one it would look like `Creeps`."""
+        lasted_s = float(stops["elapsed_s"].max(initial=0.0))
+        known = bool(self.params(stops.rig)) and 0.0 < lasted_s < np.inf
+        return tuple(float(f"{share * lasted_s:.3g}") for share in (0.05, 0.1, 0.2) if known)
+
+    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
+        """How much of it has happened (K,) at times since the first stop."""
+        return 1.0 - np.exp(-elapsed_s / self.shape)

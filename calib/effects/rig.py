@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import nearest_times, step_times
+from calib.effects.basis import Creeps, Settles, Slips
 from calib.rig import Rig
 
 DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -39,7 +39,7 @@ class FrameOffset(Effect):
         return basis
 
 
-class MountSlip(Effect):
+class MountSlip(Slips):
     """The mount slips once, and stays where it slipped to.
 
     A step of the first frame beyond the arm's tip, or, without an arm, beyond the root.
@@ -53,16 +53,8 @@ class MountSlip(Effect):
     covariates = ("elapsed_s",)
     confounded_with = ("mount_creep", "mount", "optitrack_distortion")
     source = "size assumed"
-    shape_name, shape = "t_s", 900.0
-    jumps = True
     of_lidar = True
     sigma = np.repeat([0.001, 0.001], 3)
-
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        return step_times(stops) if self.params(stops.rig) else ()
-
-    def beside(self, stops: View) -> tuple[float, ...]:
-        return nearest_times(stops, self.shape) if self.params(stops.rig) else ()
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return self.moves() if mount_edges(rig) else ()
@@ -82,12 +74,8 @@ class MountSlip(Effect):
         basis[:, mount_edges(view.rig)[0]] = by[:, None, None] * np.eye(6)
         return basis
 
-    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
-        """How much of the motion has happened (K,) at times since the first stop."""
-        return (elapsed_s > self.shape).astype(float)
 
-
-class MountCreep(MountSlip):
+class MountCreep(Creeps, MountSlip):
     """The mount gives way little by little, evenly in time; per hour."""
 
     name = "mount_creep"
@@ -95,40 +83,16 @@ class MountCreep(MountSlip):
     formula = "T_tip_mount = T_cad exp(theta * t / 1 h), t since the first stop"
     typical = "0.05 to 0.5 mm per hour, size assumed; printed resin relaxes"
     confounded_with = ("mount_slip", "warmup_drift", "mount")
-    shape_name, shape = "", 0.0
-    jumps = False
     sigma = np.repeat([0.002, 0.001], 3)
 
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        return ()
 
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(p.name, f"{p.unit}/h", p.sigma) for p in super().params(rig))
-
-    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
-        """How much of the motion has happened (K,) at times since the first stop."""
-        return elapsed_s / 3600.0
-
-
-class MountSettle(MountSlip):
+class MountSettle(Settles, MountSlip):
     """The mount settles: it moves fast at first, then ever more slowly, to where it stays."""
 
     name = "mount_settle"
     formula = "T_tip_mount = T_cad exp(theta * (1 - exp(-t / tau))), t since the first stop"
     typical = "0.1 to 1 mm, 0.1 to 1 mrad, size assumed; printed resin and rubber relax"
     confounded_with = ("mount_creep", "mount_slip", "warmup_drift")
-    shape_name, shape = "tau_s", 300.0
-    jumps = False
-
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        """Shares of the time measured in: after a longer one it would look like `mount_creep`."""
-        lasted_s = float(stops["elapsed_s"].max(initial=0.0))
-        known = bool(self.params(stops.rig)) and 0.0 < lasted_s < np.inf
-        return tuple(float(f"{share * lasted_s:.3g}") for share in (0.05, 0.1, 0.2) if known)
-
-    def when(self, elapsed_s: np.ndarray) -> np.ndarray:
-        """How much of the motion has happened (K,) at times since the first stop."""
-        return 1.0 - np.exp(-elapsed_s / self.shape)
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.rig import MountCreep, MountSettle, MountSlip, mount_edges
+from calib.effects.basis import Creeps, Settles
+from calib.effects.rig import MountCreep, MountSlip, mount_edges
 from calib.rig import Rig
 from chains import se3
 
@@ -146,25 +147,20 @@ class TrackerSlip(MountSlip):
         return by[:, None, None, None] * se3.adjoint(T_body_opti)
 
 
-class TrackerCreep(MountCreep, TrackerSlip):
+class TrackerCreep(Creeps, TrackerSlip):
     """The tracker, or what the base stands on, creeps: evenly in time, per hour. These data cannot
-    tell which of the two moves.
-
-    It moves what `TrackerSlip` moves, as `MountCreep` moves it.
-    """
+    tell which of the two moves."""
 
     name = "tracker_creep"
     formula = "T_opti_body as seen = exp(theta * t / 1 h) T_opti_body, t since the first stop"
     typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
     confounded_with = ("mount_creep", "tracker_slip", "warmup_drift")
+    unit, sigma = MountCreep.unit, MountCreep.sigma
 
 
-class TrackerSettle(MountSettle, TrackerSlip):
+class TrackerSettle(Settles, TrackerSlip):
     """The tracker, or what the base stands on, settles: fast at first, then ever more slowly. These
-    data cannot tell which of the two moves.
-
-    It moves what `TrackerSlip` moves, as `MountSettle` moves it.
-    """
+    data cannot tell which of the two moves."""
 
     name = "tracker_settle"
     formula = "T_opti_body as seen = exp(theta * (1 - exp(-t / tau))) T_opti_body"

@@ -68,8 +68,13 @@ class Group:
         """As ``--without`` takes it: ``WHERE:WHAT``, the recording before it where that matters."""
         return f"{self.recording}/{self.bare}".removeprefix("/")
 
+    @property
+    def named(self) -> str:
+        """What it is at a stop, whichever stop."""
+        return {SCAN: "the scan", JOINTS: "the joints"}.get(self.what, self.what)
+
     def __str__(self) -> str:
-        what = {SCAN: "the scan", JOINTS: "the joints"}.get(self.what, self.what)
+        what = self.named
         of = f"{self.recording}, {self.where}".removeprefix(", ")
         if self.kind == "target":
             return f"target {of}: its {what}"

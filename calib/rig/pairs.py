@@ -9,6 +9,8 @@ import numpy as np
 
 from calib.rig import Rig
 from chains import se3
+from chains.align import hand_eye
+from chains.errors import InputError
 from chains.se3 import Array
 from sensors.recording import RecordedStops
 
@@ -139,6 +141,20 @@ def from_places(pair: SeenPair, roots: Mapping[int, Array]) -> Array:
     for p, T in roots.items():
         nominal[pair.place == p] = T @ nominal[pair.place == p]
     return nominal
+
+
+def turns(pair: SeenPair, seen: Array) -> tuple[float, float]:
+    """Rad by which a body turns otherwise than the joints say, median, whatever it hangs on and
+    wherever the rig stands, and by which it hangs otherwise than CAD says; 0 where not to be told.
+    """
+    places, index = np.unique(pair.place, return_inverse=True)
+    at = index == np.bincount(index, minlength=len(places)).argmax()
+    try:
+        X, Z = hand_eye(seen[at], pair.nominal[at])
+    except InputError:
+        return 0.0, 0.0
+    left = gap_of(Z @ pair.nominal[at] @ X, seen[at])
+    return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(size_of(se3.log(X)[:3]))
 
 
 def gap_of(a: Array, b: Array) -> Array:

@@ -1,10 +1,13 @@
-"""Something in a recording that is likely wrong, told before any fit."""
+"""Something in a recording that is likely wrong, told before any fit; and what lasts from stop to
+stop."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,80 @@ class Suspect:
         """An entry for each stop, or one for all, with the keys of a diagnosis's blunders."""
         fields = {"kind": self.kind, "name": self.name, "size": self.size, "unit": self.unit}
         return [fields | {"stop": stop} for stop in (*self.stops,) or (None,)]
+
+
+SO_BY_CHANCE = 0.01  # a choice: how often stops each wrong by itself may follow each other so
+
+
+@dataclass(frozen=True)
+class Spell:
+    """Stops that follow each other in time, and what is wrong at them is wrong for as long.
+
+    Args:
+        stops: their names, from the first to the last at which it is wrong.
+        wrong: names of those of them at which it is.
+        before, after: the stops next to them; None where the recording begins or ends.
+        p_value: how likely as many wrong stops would lie within as few, were each wrong by itself.
+    """
+
+    stops: tuple[str, ...]
+    wrong: tuple[str, ...]
+    before: str | None
+    after: str | None
+    p_value: float
+
+    @property
+    def since(self) -> str:
+        """Between which stops something changed."""
+        ends = zip((self.before, self.stops[-1]), (self.stops[0], self.after), strict=True)
+        return " and ".join(f"between {a} and {b}" for a, b in ends if a and b)
+
+    def __str__(self) -> str:
+        most = len(self.wrong) < len(self.stops)
+        of = f"{len(self.wrong)} of {len(self.stops)}" if most else f"all {len(self.stops)}"
+        return f"at {of} stops from {self.stops[0]} to {self.stops[-1]}"
+
+
+def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> list[Spell]:
+    """Spans of stops in which so many are wrong that it is no chance, the least likely first.
+
+    Of m stops among n that are each wrong by themselves, k or more lie within w that follow each
+    other with the hypergeometric tail; there are n - w + 1 such spans of each of n lengths
+    (Bonferroni).
+
+    Args:
+        stops: names.
+        time_s: (n,) of each; where one has none, the order of rows counts.
+        wrong: names of those that are.
+    """
+    if len(wrong) < 3:  # of two no span is significant, however many stops there are
+        return []
+    from scipy.stats import hypergeom
+
+    n, out = len(stops), []
+    order = np.argsort(time_s, kind="stable") if np.isfinite(time_s).all() else np.arange(n)
+    names = [stops[k] for k in order]
+    bad = np.isin(names, [*wrong])
+    while bad.sum() > 2:
+        edges = np.diff(bad.astype(int), prepend=0, append=0)
+        first, end = np.flatnonzero(edges == 1)[:, None], np.flatnonzero(edges == -1)[None, :]
+        width, sums = end - first, np.concatenate([[0], np.cumsum(bad)])
+        tail = hypergeom.sf(sums[end] - sums[first] - 1, n, bad.sum(), width)
+        p = np.where(width > 0, tail * (n - width + 1) * n, np.inf)
+        i, j = np.unravel_index(p.argmin(), p.shape)
+        if p[i, j] >= SO_BY_CHANCE:
+            break
+        a, b = int(first[i, 0]), int(end[0, j])
+        spell = Spell(
+            stops=tuple(names[a:b]),
+            wrong=tuple(name for name, is_bad in zip(names[a:b], bad[a:b], strict=True) if is_bad),
+            before=names[a - 1] if a else None,
+            after=names[b] if b < n else None,
+            p_value=float(p[i, j]),
+        )
+        out.append(spell)
+        bad[a:b] = False
+    return out
 
 
 def listed(names: Sequence[Any], most: int = 3, between: str = ", ") -> str:

@@ -5,6 +5,7 @@ out."""
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -21,11 +22,10 @@ from calib.rig.pairs import (
     pairs_of,
     roots_of,
     size_of,
+    turns,
 )
-from calib.rig.suspect import Suspect, listed
+from calib.rig.suspect import Spell, Suspect, listed, spells
 from chains import se3
-from chains.align import hand_eye
-from chains.errors import InputError
 from chains.se3 import Array
 from sensors.recording import RecordedStops
 
@@ -42,6 +42,7 @@ MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of th
 # choice, as one in ten was left where columns were moved back, and all where they were not.
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
+ITS_ROW = "; look at its row"
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
@@ -57,6 +58,7 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
     met: dict[int, list[tuple[SeenPair, Array, bool]]] = {}
+    pairs: list[SeenPair] = []
     for pair in pairs_of(rig, recording, usable):
         wrong = _at_all_stops(pair) or _misread(rig, recording, pair)
         if wrong is not None:
@@ -64,10 +66,16 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
             return
         told = yield from _of_some_rows(rig, recording, pair)
         pair = pair.some(~np.isin(pair.stops, [*told]))
+        pairs.append(pair)
         for k, gap, exchanged in _outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
+    by_body: dict[tuple[str, bool], dict[str, Suspect]] = {}
     for stop, found in sorted(met.items()):
-        yield _at_one_stop(rig, recording.stops[stop], found)
+        name = recording.stops[stop]
+        one = _at_one_stop(rig, name, found)
+        by_body.setdefault((one.name, found[0][2]), {})[name] = one
+    for at_stops in by_body.values():
+        yield from _those_that_last(rig, recording, pairs, at_stops)
 
 
 # --------------------------------------------------------------------------------- placeholders
@@ -120,9 +128,9 @@ def _at_all_stops(pair: SeenPair) -> Suspect | None:
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
             return Suspect("body", names, said)
-    if _turns(pair, seen)[0] < TURNED_RAD:
+    if turns(pair, seen)[0] < TURNED_RAD:
         return None
-    orders = {order: _turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
+    orders = {order: turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
     fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
     if not fitting:
         return None
@@ -132,20 +140,6 @@ def _at_all_stops(pair: SeenPair) -> Suspect | None:
         "their order"
     )
     return Suspect("body", names, said)
-
-
-def _turns(pair: SeenPair, seen: Array) -> tuple[float, float]:
-    """Rad by which a body turns otherwise than the joints say, median, whatever it hangs on and
-    wherever the rig stands, and by which it hangs otherwise than CAD says; 0 where not to be told.
-    """
-    places, index = np.unique(pair.place, return_inverse=True)
-    at = index == np.bincount(index, minlength=len(places)).argmax()
-    try:
-        X, Z = hand_eye(seen[at], pair.nominal[at])
-    except InputError:
-        return 0.0, 0.0
-    left = gap_of(Z @ pair.nominal[at] @ X, seen[at])
-    return float(np.median(np.linalg.norm(left[:, :3], axis=1))), float(size_of(se3.log(X)[:3]))
 
 
 # ------------------------------------------------------------------------------- at some rows
@@ -164,7 +158,28 @@ def _of_some_rows(
         suspect, rows = said
         yield suspect
         return rows
-    return (yield from _stood_still(rig, recording, pair, off))
+    still = yield from _stood_still(rig, recording, pair, off)
+    return still or (yield from _for_a_while(rig, recording, pair, off))
+
+
+def _for_a_while(
+    rig: Rig, recording: RecordedStops, pair: SeenPair, off: set[int]
+) -> Generator[Suspect, None, set[int]]:
+    """Columns exchanged or read otherwise at stops that follow each other; returns at which."""
+    found: set[int] = set()
+    for spell in spells(recording.stops, recording.time_s, [recording.stops[k] for k in off]):
+        if one := _as_one(rig, recording, pair, spell):
+            yield one
+            found.update(np.flatnonzero(np.isin(recording.stops, spell.stops)).tolist())
+    return found
+
+
+def _as_one(rig: Rig, recording: RecordedStops, pair: SeenPair, spell: Spell) -> Suspect | None:
+    """What is wrong at stops that follow each other, as what would be wrong at all were these
+    all."""
+    there = pair.some(np.isin(pair.stops, np.flatnonzero(np.isin(recording.stops, spell.stops))))
+    one = _at_all_stops(there) or _misread(rig, recording, there)
+    return one and replace(one, sentence=f"{spell} {one.sentence}", stops=spell.stops)
 
 
 def _out_of_step(
@@ -339,6 +354,27 @@ def _robust(A: Array, b: Array) -> tuple[Array, float]:
     return b - A @ x, taken
 
 
+def _those_that_last(
+    rig: Rig, recording: RecordedStops, pairs: Sequence[SeenPair], at_stops: Mapping[str, Suspect]
+) -> Iterator[Suspect]:
+    """What is wrong with a body at stops, and once for those that follow each other."""
+    alone = dict(at_stops)
+    for spell in spells(recording.stops, recording.time_s, [*at_stops]):
+        found = [alone.pop(stop) for stop in spell.wrong]
+        as_one = (_as_one(rig, recording, pair, spell) for pair in pairs)
+        if one := next(filter(None, as_one), None):
+            yield one
+            continue
+        worst = max(found, key=lambda one: one.size or 0.0)
+        (where,) = worst.stops
+        said = worst.sentence.removeprefix(f"at {where} ")
+        if said.endswith(ITS_ROW):
+            said = f"{said.removesuffix(ITS_ROW)}, most of all at {where}"
+        said = f"{spell} {said}; look at what changed {spell.since}"
+        yield replace(worst, sentence=said, stops=spell.wrong)
+    yield from alone.values()
+
+
 def _at_one_stop(rig: Rig, stop: str, found: list[tuple[SeenPair, Array, bool]]) -> Suspect:
     """One stop's bodies that stand out: the one that all pairs have in common, if there is one."""
     pair, gap, exchanged = found[0]
@@ -351,6 +387,6 @@ def _at_one_stop(rig: Rig, stop: str, found: list[tuple[SeenPair, Array, bool]])
         joints = any(rig.joints_to(name) for p, *_ in found for name in p.names)
         said = (
             f"at {stop} {names} is {shift_mm:.3g} mm and {turn_deg:.2g} deg from where other stops"
-            f"{' and the joints' if joints else ''} put it; look at its row"
+            f"{' and the joints' if joints else ''} put it{ITS_ROW}"
         )
     return Suspect("body", names, said, stops=(stop,), size=float(shift_mm / 1e3), unit="m")

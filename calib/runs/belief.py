@@ -73,7 +73,7 @@ def forbids(run: Run) -> list[str]:
     """Why a run is not to be believed, a clause each; none where nothing speaks against it."""
     out = [] if run.converged else ["the fit has not converged"]
     if run.set_aside:
-        out.append(f"{', '.join(run.set_aside)} contradict everything else, and were set aside")
+        out.append(f"{run.listed_aside} contradict everything else, and were set aside")
     misfit = run.summary["misfit"].items()
     out += [_misfit(run, kind, times) for kind, times in misfit if times > FAR_OFF]
     if (times := over_floor(run)) > FAR_OFF:

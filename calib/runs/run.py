@@ -24,6 +24,7 @@ from calib.results.solution import (
     Solution,
     units_of,
 )
+from calib.rig.suspect import listed
 from calib.runs.stored import FIT_AGAIN, read_arrays, read_json, read_model, read_summary
 from chains import remote, se3
 from chains.errors import InputError
@@ -144,9 +145,7 @@ class Run:
         """Why the fit may not be what it should be, a sentence each."""
         out = [] if self.converged else [NOT_CONVERGED]
         if self.set_aside:
-            out.append(
-                f"Set aside, as they contradict everything else: {', '.join(self.set_aside)}."
-            )
+            out.append(f"Set aside, as they contradict everything else: {self.listed_aside}.")
         return out
 
     @property
@@ -173,6 +172,11 @@ class Run:
     def set_aside(self) -> list[str]:
         """Scans, and bodies at stops, that the fit could not use."""
         return list(self.summary.get("set_aside", ()))
+
+    @property
+    def listed_aside(self) -> str:
+        """The first few of them, and how many more there are."""
+        return listed(self.set_aside, 6)
 
     @property
     def left_out(self) -> list[str]:

@@ -159,9 +159,27 @@ def lag(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
     return _turning(world, s, np.abs(_each(rng, s)) * went)
 
 
+def _one_joint(s: Session, rng: np.random.Generator) -> np.ndarray:
+    return np.eye(s.joints.shape[1])[rng.integers(s.joints.shape[1])]
+
+
 def joint_slip(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
-    one = np.eye(s.joints.shape[1])[rng.integers(s.joints.shape[1])]
+    one = _one_joint(s, rng)
     return _turning(world, s, np.outer(s.share > rng.uniform(0.3, 0.7), one))
+
+
+def joint_creep(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    return _turning(world, s, np.outer(s.share, _one_joint(s, rng)))
+
+
+def joint_settle(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    course = 1.0 - np.exp(-s.time_s / 400.0)
+    return _turning(world, s, np.outer(course, _one_joint(s, rng)))
+
+
+def joint_thermal(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    """All joints, each by a coefficient of its own."""
+    return _turning(world, s, np.outer(s.temperature_c - 20.0, rng.normal(size=s.joints.shape[1])))
 
 
 def joint_scatter(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
@@ -286,6 +304,9 @@ KINDS: Mapping[str, Kind] = {
     "backlash": _kind(backlash, "arm_backlash"),
     "lag": _kind(lag, "arm_joint_lag"),
     "joint slip": _kind(joint_slip, "arm_joint_slip"),
+    "joint creep": _kind(joint_creep, "arm_joint_creep"),
+    "joint settle": _kind(joint_settle, "arm_joint_settle"),
+    "joint thermal": _kind(joint_thermal, "arm_joint_thermal", needs=("temperature_c",)),
     "joint scatter": _kind(joint_scatter, "joint_scatter"),
     "thermal growth": _kind(thermal_growth, "arm_thermal_growth", needs=("temperature_c",)),
     "link bending": _kind(link_bending, "arm_link_bending"),

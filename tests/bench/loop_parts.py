@@ -41,7 +41,7 @@ PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "graph": (*((Graph, n) for n in ("__init__", "step", "solve", "error")), (KeptRows, "of")),
     "covariance": ((Graph, "covariance"), (Linearisation, "covariance")),
     "testing": (*((stand, n) for n in ("project", "screen")), (diagnose, "weak_directions")),
-    "writing": tuple((calibrate, n) for n in ("write_table", "write_yaml", "write_json")),
+    "writing": tuple((calibrate, n) for n in ("write_residuals", "write_yaml", "write_json")),
 }
 
 

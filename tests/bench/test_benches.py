@@ -28,6 +28,7 @@ def bench() -> Iterator[SimpleNamespace]:
         "bench_memory",
         "bench_screen",
         "bench_scale",
+        "loop_parts",
     )
     sys.path.insert(0, str(HERE))
     try:
@@ -41,6 +42,12 @@ def work(bench, tmp_path_factory):
     """A small workload."""
     folder = bench.workload.recorded(tmp_path_factory.mktemp("bench"), ROWS, STOPS)
     return bench.workload.Work.of(bench.workload.held(folder))
+
+
+def test_parts_of_the_loop_are_functions_that_there_are(bench):
+    """The profile of a fit and a diagnosis puts clocks around them by name."""
+    named = [each for functions in bench.loop_parts.PARTS.values() for each in functions]
+    assert [(owner, name) for owner, name in named if not hasattr(owner, name)] == []
 
 
 @pytest.mark.parametrize("given", [True, False], ids=["rows given", "rows computed"])

@@ -8,6 +8,7 @@ from typing import Any
 
 from calib.blunders import told
 from calib.blunders.judged import Blunder
+from calib.blunders.lasting import lasting, told_once
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
@@ -52,6 +53,7 @@ class Diagnosis:
         weak_directions: what the data hardly determine, and what would.
         untestable: effect -> what the recordings lack to test it.
         blunders: groups of rows that were left out, as nothing but a mishap explains them.
+        lasting: those of them that follow each other, as one.
         groups: all groups of rows that were looked at, and how far out each is.
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
@@ -77,6 +79,7 @@ class Diagnosis:
     misfit: Mapping[str, float]
     curves: Sequence[Curve] = field(repr=False)
     blunders: Sequence[Mapping[str, Any]] = ()
+    lasting: Sequence[Mapping[str, Any]] = ()
     groups: Sequence[Blunder] = field(default=(), repr=False)
     too_few: bool = False
     command: str = ""
@@ -117,6 +120,7 @@ class Diagnosis:
             "weak_directions": list(self.weak_directions),
             "untestable": dict(self.untestable),
             "blunders": list(self.blunders),
+            "lasting": list(self.lasting),
             "command": self.command or None,
             "plan": self.plan or None,
             "remedies": list(self.remedies),
@@ -169,14 +173,14 @@ def conclude(
     calm = BAD if forbids else UNNAMED if doubt else "adequate"
     answer = hold and not formulas.needless
     verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
-    worn = list(formulas.needless)
-    if verdict == UNNAMED or formulas.instead:
-        worn = dressed_up(found, held_out, hold, formulas)
+    stands_in = verdict == UNNAMED or formulas.instead
+    worn = dressed_up(found, held_out, hold, formulas) if stands_in else [*formulas.needless]
     deferred = not found.scatter_judged and (verdict == UNNAMED or bool(formulas.formulas))
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable, unsure = _untestable(first), unconfirmed(doubt, over) if doubt else ""
-    told_of = verdict, heavy, candidates, unexplained, untestable, blunders
+    last = [*lasting(found.blunders, sources)]
+    told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
     return Diagnosis(
@@ -187,6 +191,7 @@ def conclude(
         weak_directions=weak,
         untestable=untestable,
         blunders=blunders,
+        lasting=last,
         groups=[*(left.blunder for left in found.blunders), *(found.beside or first).blunders],
         misfit=summary["misfit"],
         curves=curves(first.unnamed),
