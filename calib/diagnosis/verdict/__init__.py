@@ -162,9 +162,7 @@ def conclude(
     """
     heavy = weighed(found, held_out, judged_mm(summary))
     found, first = heavy.found, found.looks[0]
-    sources = first.stand.sources
-    blunders = [*plain, *(rejected.blunders(sources) if rejected and not found.found else [])]
-    blunders += [told.document(left, sources) for left in found.blunders]
+    blunders = _blunders(found, rejected, plain)
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
@@ -179,7 +177,7 @@ def conclude(
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable, unsure = _untestable(first), unconfirmed(doubt, over) if doubt else ""
-    last = [*lasting(found.blunders, sources)]
+    last = [*lasting(found.blunders, first.stand.sources)]
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
@@ -199,6 +197,15 @@ def conclude(
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
+
+
+def _blunders(
+    found: Search, rejected: Rejects | None, plain: Sequence[Mapping[str, Any]]
+) -> list[Mapping[str, Any]]:
+    """All that is wrong in the recordings; arguments as of `conclude`."""
+    sources = found.looks[0].stand.sources
+    thrown = rejected.blunders(sources) if rejected and not found.found else ()
+    return [*plain, *thrown, *(told.document(left, sources) for left in found.blunders)]
 
 
 def _caution(
