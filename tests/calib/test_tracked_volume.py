@@ -119,11 +119,22 @@ def test_a_scale_that_all_the_tracker_sees_has_is_named_and_nothing_beside_it(tm
         assert len(longer) == 6
         table[longer] *= 1 + SCALE
         table.to_csv(path, index=False)
-    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run")).document()
-    named = [c for c in found["candidates"] if c["step"]]
-    assert [c["add"] for c in named] == ["optitrack_scale"]
-    (scale,), (sigma,) = named[0]["parameters"]["estimate"], named[0]["parameters"]["sigma"]
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
+    found = diagnose(run).document()
+    (named,) = (c for c in found["candidates"] if c["step"])
+    assert named["add"] == "optitrack_scale"
+    (scale,), (sigma,) = named["parameters"]["estimate"], named["parameters"]["sigma"]
     assert abs(scale - SCALE) < 4 * sigma
+    (pair,) = named["together"]
+    assert "it from range_scale and faro_scale together." in " ".join(found["sentences"])
+    both = add(run, pair["effects"], tmp_path / "both")
+    estimate = [float(both.solution.shared.effects[n].estimate[0]) for n in pair["effects"]]
+    sigma = [float(both.solution.shared.effects[n].sigma[0]) for n in pair["effects"]]
+    assert np.all(np.abs(np.subtract(estimate, pair["estimate"])) < 4 * np.array(sigma))
+    left = next(
+        c for c in diagnose(both).document()["candidates"] if c["effect"] == "optitrack_scale"
+    )
+    assert left["statistic"] < 0.01 * named["statistic"] and not left["step"]
 
 
 @pytest.mark.parametrize("arm", ["puma560", "panda"])

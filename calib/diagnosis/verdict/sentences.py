@@ -213,6 +213,10 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     ]
     if step.effect.twin:
         out.append(f"Nothing that was measured tells it from {step.effect.twin}.")
+    out += [
+        f"Nothing that was measured tells it from {all_of(pair['effects'])} together."
+        for pair in candidate["together"]
+    ]
     return [*out, *map(rival_sentence, candidate["rivals"][:MOST_LISTED])]
 
 
