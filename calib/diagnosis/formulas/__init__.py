@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from calib.diagnosis.formulas.pursuit import ConfirmedTerm, pursue
 from calib.diagnosis.formulas.table import BeamTable, Projection
 from calib.diagnosis.stand import Stand
 from calib.linear.layout import Layout
-from calib.linear.parallel import in_order
 from calib.problem import Problem
 from calib.solve.fit import Progress
 
@@ -39,28 +38,13 @@ def find(stand: Stand, progress: Progress, by_location: bool = False) -> list[Fo
         return settled(table, steps, RANGE_SITE) if steps else []
     tables = dict(joint_tables(stand))
     alpha = LEVELS["structure"] / max(len(tables), 1)
-    first = _first_of_each(tables, alpha, progress)
+    first = {name: pursue(table, alpha, progress, most=1) for name, table in tables.items()}
     left = {name: _left(tables[name], steps) for name, steps in first.items() if steps}
     if not left:
         return []
     joint = min(left, key=left.__getitem__)
     steps = pursue(tables[joint], alpha, progress, found=first[joint])
     return settled(tables[joint], steps, JOINT_SITE + joint)
-
-
-def _first_of_each(
-    tables: Mapping[str, BeamTable], alpha: float, progress: Progress
-) -> dict[str, list[ConfirmedTerm]]:
-    """The first step of each joint's pursuit; joints side by side."""
-    names, first = list(tables), {}
-
-    def step(i: int) -> list[ConfirmedTerm]:
-        return pursue(tables[names[i]], alpha, lambda what, done, total: None, most=1)
-
-    for name, steps in zip(names, in_order(step, len(names)), strict=True):
-        first[name] = steps
-        progress("searching covariates of the residuals", len(first), len(names))
-    return first
 
 
 def _left(table: BeamTable, steps: Sequence[ConfirmedTerm]) -> float:
