@@ -152,8 +152,9 @@ class Assembly:
             self._finish_scanned()
 
     def add_kept(self, sums: KeptSums) -> None:
-        """Add the sums of whitened rows about kept unknowns."""
+        """Add the sums of whitened rows of scatter within holds, which are about kept unknowns."""
         self.chi2 += float(sums.gram[-1, -1])
+        self.beams_chi2 += float(sums.gram[-1, -1])
         self.touched[sums.columns] |= np.diag(sums.gram)[:-1] > 0
         unit = np.append(self.layout.sigma[sums.columns], 1.0)
         at = np.append(self.at[sums.columns], len(self.columns) - 1)

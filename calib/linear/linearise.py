@@ -147,7 +147,10 @@ def beams_cost(
     associations: Sequence[Association],
     weighed: Sequence[Weighing],
 ) -> float:
-    """Half the robust chi-square of all beams at a state, and of their scatter within holds.
+    """Half the robust chi-square of all beams at a state.
+
+    Rows of their scatter within holds have no part in what a fit is to lower: their weights go by
+    the noise that they tell of, so they come to rest where their score is 0, and not at a minimum.
 
     Args:
         problem: what is estimated.
@@ -164,8 +167,7 @@ def _cost_of_stop(
     values: Values, scan: ScanStop, placed: Placed, association: Association, weighed: Weighing
 ) -> float:
     rows = scan.rows(values, association, placed.T[0])
-    scatter = 0.0 if rows.spread is None else float(np.square(rows.spread.residual).sum()) / 2
-    return weighed.cost(rows, partial(_rows_at, scan, association)) + scatter
+    return weighed.cost(rows, partial(_rows_at, scan, association))
 
 
 def _rows_at(

@@ -40,7 +40,7 @@ class Linearisation:
         scans: stop -> what its beams say of a shift that it alone has; empty unless gradients were
             asked for.
         weight_m2: sum of the beams' weights over their variances, 1/m2.
-        beams_chi2: what of chi2 is of beams, at their weights.
+        beams_chi2: what of chi2 is of beams, at their weights, and of their scatter within holds.
         weighed: per stop with beams, how they were weighed here.
         beams_cost: half their robust chi-square, so weighed.
         cost_before: the same as they were weighed elsewhere; None where that was not asked for.

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from calib.effects import Site
 from calib.forward import Derivatives, Term, Values
 from calib.problem.model import Source
 from calib.problem.unknowns import Unknown
@@ -125,6 +126,12 @@ class Problem:
     def seen(self) -> list[SeenBody]:
         """The blocks of bodies at stops, whatever instrument sees them."""
         return [block for block in self.blocks if isinstance(block, SeenBody)]
+
+    @property
+    def of_noise(self) -> list[Unknown]:
+        """The unknowns of effects on the noise, by which rows are weighed."""
+        terms = {t.variable: t for some in self.terms for t in some}.values()
+        return [self.variables[t.variable] for t in terms if t.effect.site is Site.NOISE]
 
     @property
     def set_aside(self) -> frozenset[str]:

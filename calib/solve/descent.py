@@ -15,6 +15,7 @@ from calib.linear.rows import State, Weighing
 from calib.linear.system import Linearisation
 from calib.outputs.journal import Answer, Journal
 from calib.problem.problem import Block, Problem
+from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
 from calib.solve.estimate import cost_of
@@ -54,6 +55,8 @@ class Pass:
         compute: linearises everything there: that, and the graph that it is in.
         journal: of the fit; None where the pass is not worth keeping.
         asked: what the linearisation depends on beside the state and what was asked before.
+        of_noise: unknowns by which rows are weighed: no cost that is to fall depends on their
+            priors, nor on the rows of scatter that tell of them.
     """
 
     def __init__(
@@ -62,7 +65,9 @@ class Pass:
         compute: Callable[[], tuple[Linearisation, Graph]],
         journal: Journal | None,
         asked: Mapping[str, object],
+        of_noise: Sequence[Unknown] = (),
     ) -> None:
+        self.of_noise = of_noise
         self.values, self._compute, self._journal = values, compute, journal
         self._whole: tuple[Linearisation, Graph] | None = None
         self._found = self._answer(asked, self._summary)
@@ -84,8 +89,10 @@ class Pass:
     def _summary(self) -> Answer:
         linear, graph = self.whole
         before = np.nan if linear.cost_before is None else linear.cost_before
+        moved = ((self.values[u.name] - u.mean) / u.sigma for u in self.of_noise)
+        aside = (linear.beams_chi2 + sum(float(each @ each) for each in moved)) / 2
         return {
-            "of_rest": np.float64(cost_of(linear, graph, self.values) - linear.beams_chi2 / 2),
+            "of_rest": np.float64(cost_of(linear, graph, self.values) - aside),
             "of_beams": np.float64(linear.beams_cost),
             "before": np.float64(before),
             "T": np.array([each.T for each in linear.weighed]),
@@ -302,7 +309,9 @@ class Descent:
         asked |= {"weighed": [each.scale for each in weighed]}
         worth = beams and bool(self.problem.scans)  # trackers and targets alone cost little
         compute = self.linearising(self.values, beams, **how)
-        self.here = Pass(self.values, compute, self.journal if worth else None, asked)
+        journal = self.journal if worth else None
+        of_noise = self.problem.of_noise
+        self.here = Pass(self.values, compute, journal, asked=asked, of_noise=of_noise)
 
     def linearising(
         self,

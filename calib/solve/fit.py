@@ -146,14 +146,16 @@ def _stay_below(loop: Loop, descend: Callable[[], bool]) -> None:
 
 
 def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
-    """Whether the cost is above that of the start, all rows weighed as they are here.
+    """Whether the cost is above that of the start, all rows weighed as they are here, and as noisy:
+    where their sigmas are estimated as well, a smaller one costs more and is no ascent.
 
     Args:
         loop: the fit.
         more, least: by how much it may be above it: of it, and at any rate.
     """
     loop.linearise_here()
-    first, cost = values_of(loop.problem, loop.start.state), loop.cost()
+    noise = {u.name: loop.values[u.name] for u in loop.problem.of_noise}
+    first, cost = values_of(loop.problem, loop.start.state) | noise, loop.cost()
     linear, graph = loop.linearising(first, beams=False)()
     asked = loop.problem, first, loop.associations, loop.here.weighed
     of_beams = loop.journal.answer(first, lambda: {"cost": np.float64(beams_cost(*asked))})["cost"]

@@ -44,6 +44,20 @@ def test_the_power_of_range_is_found_within_its_sigma(tmp_path):
     assert abs(stand.estimate.values["noise_range"][0] - true) < 4 * sigma
 
 
+def test_added_to_a_model_it_ends_where_a_fit_from_the_start_does(tmp_path):
+    """Sigmas change with it, so costs before and after are not of the same rows; no such fit was
+    called converged."""
+    with_it = Model().plus((effects.find("noise_range"),))
+    stand, _ = fitted(tmp_path, 1.0, Model())
+    added = stand.with_effects([effects.find("noise_range")], quiet).estimate
+    anew = solve(problems.build(stand.sources, with_it))
+    assert added.converged and anew.converged
+    names = [v.name for v in anew.variables if v.kind == "vector"]
+    for name in (*names, "noise_range"):
+        sigma = np.sqrt(np.diag(anew.covariance_of([name])))
+        assert np.abs(added.values[name] - anew.values[name]).max() < 0.02 * sigma.min()
+
+
 def test_it_stands_out_where_it_is_and_not_where_it_is_not(tmp_path):
     found = {}
     for size in (0.0, 1.0):
