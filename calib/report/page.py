@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from calib.diagnosis.search.confirmed import ALPHA_EFFECT
-from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.effects import CATALOGUE
 from calib.report.calibration import calibration_tables
 from calib.report.chart import Absent, Chart
@@ -132,7 +131,6 @@ def render(
         headings=BLUNDER_HEADINGS,
         blunders=[blunder_cells(b) for b in (evidence.diagnosis or {}).get("blunders", ())],
         candidates=_candidates(evidence),
-        formulas=_formulas(evidence),
         detectable=_detectable(evidence),
         weak=_weak(evidence),
         untold=_untold(evidence),
@@ -216,12 +214,6 @@ def _candidates(evidence: Evidence) -> dict[str, list[dict[str, Any]]]:
     ]
     confirmed = [c for c in told if c["confirmed"]]
     return {"confirmed": confirmed, "others": [c for c in told if c not in confirmed]}
-
-
-def _formulas(evidence: Evidence) -> bool:
-    """Whether formulas are the answer, and no effect that is known."""
-    found = evidence.diagnosis or {"verdict": "", "unexplained": []}
-    return found["verdict"] == UNNAMED and any("says" in each for each in found["unexplained"])
 
 
 def _told(candidate: dict[str, Any]) -> list[str]:

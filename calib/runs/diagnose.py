@@ -248,13 +248,14 @@ def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
 
 
 def _command(run: Run, found: Diagnosis) -> str:
-    """What to do next: leave out what is wrong, or add what no known effect explains."""
+    """What to do next: leave out what is wrong, or add what is missing."""
     if tokens := told.tokens(found.blunders):
         return command_without(run, tokens)
-    if not found.formulas:
-        return ""
     names = [*found.worth_adding, *found.formulas]
-    return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", f"{run.folder}-formula"])
+    if found.blunders or not names:
+        return ""
+    out = f"{run.folder}-{'formula' if found.formulas else 'added'}"
+    return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", out])
 
 
 def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:

@@ -118,7 +118,7 @@ def _say_found(console: Console, diagnosis: Diagnosis) -> None:
         console.print(sentence)
     console.print()
     if diagnosis.command:
-        what = "Add it to the model:" if diagnosis.formulas else LEAVE_OUT
+        what = LEAVE_OUT if diagnosis.blunders else "Add it to the model:"
         print_command(console, diagnosis.command, what)
 
 

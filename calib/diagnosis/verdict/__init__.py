@@ -58,8 +58,8 @@ class Diagnosis:
         misfit: instrument -> how many times larger than their sigmas its residuals are.
         curves: mean residual against covariates.
         too_few: whether the stops are too few to say anything, whatever the verdict.
-        command: what fits the same without the blunders, or adds the formulas of residual
-            structure, ready to be typed; empty without any.
+        command: what fits the same without the blunders, or adds what is missing, ready to be
+            typed; empty without any.
         plan: what plans stops that separate what these do not, ready to be typed; or empty.
         remedies: what would tell of each weak direction, of each group of effects that nothing
             tells apart and of each effect that could not be tested: `of` which of these, `names`,
