@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import Any
 
@@ -15,6 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.diagnosis.candidates import covariates, finer, known_effects, structure
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
+from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_serial
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
@@ -58,6 +59,11 @@ class Stand:
     def catalogue(self) -> tuple[Effect, ...]:
         """Every effect that could be missing."""
         return (*CATALOGUE, *self.own)
+
+    @cached_property
+    def beams(self) -> BeamScatter:
+        """How widely beams scatter, of a rig with scans."""
+        return BeamScatter.of(self.estimate)
 
     @cached_property
     def spent(self) -> int:
@@ -130,7 +136,7 @@ class Stand:
             named=named,
             unnamed=rest,
             noise=noise,
-            values=chances(scores, chance, at),
+            values=beside_noise(partial(chances, scores, chance, at), self),
             by_rows=by_rows,
             columns=columns,
         )
@@ -203,6 +209,19 @@ def _own_columns(scan: ScanStop) -> tuple[str, ...]:
     return (*scan.recording.covariates, *scan.store.read(first)[0].extra)
 
 
+def beside_noise(test: Callable[[float], list[Chance]], stand: Stand) -> list[Chance]:
+    """What scatters by chance, beyond what beams do by themselves: where they are noisier than
+    stated, the mean of those of a stop scatters more as well.
+
+    Args:
+        test: gives it, where beams scatter so many times as widely as stated.
+        stand: a fit.
+    """
+    found = test(1.0)
+    noisier = any(c.found for c in found) and stand.estimate.scans and stand.beams.alone
+    return test(noisier) if noisier > 1.0 else found
+
+
 @dataclass(frozen=True)
 class Look:
     """What the rows say from where a fit stands.
@@ -253,7 +272,7 @@ class Look:
         wider = [e for e in self.by_rows if e.widens]
         posed = [e for e in self.by_rows if not e.widens]
         of_rows = rows_by_chance(wider, self.blunders, self.others)
-        of_poses = of_lidar(posed, self.blunders, self.others)
+        of_poses = beside_noise(partial(of_lidar, posed, self.blunders, self.others), self.stand)
         return ranked([*self.values, *of_poses, *of_rows])
 
     def still(self, some: Sequence[Chance]) -> list[Chance]:

@@ -37,6 +37,7 @@ from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_pose
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.outstanding import moves
 from calib.results.rings import harmful, odd_rings
+from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
 from calib.runs.belief import cautions, forbids, over_floor
@@ -122,6 +123,7 @@ def _found(
             *result.sentences,
             *(told.uneven(last.blunders) if run.converged else ()),
             *hardly_checked(unseen),
+            *_noisier(run, stand),
             *map(told.whole, _cautions(run, result, last)),
             *run.omissions,
         ],
@@ -236,6 +238,12 @@ def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
     named = {left.blunder.group.what for left in found.blunders}
     moved = moves(run.summary) if run.converged else {}
     yield from (each for each in told.not_as_drawn(moved) if each["name"] not in named)
+
+
+def _noisier(run: Run, stand: Stand) -> list[str]:
+    """That beams scatter more than the noise model of the LiDAR says."""
+    noisier = run.summary["misfit"].get("beams", 0.0) > TOLERATED
+    return [stand.beams.sentence] if noisier else []
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

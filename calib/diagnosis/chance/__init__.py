@@ -212,7 +212,10 @@ class Chance:
 
 
 def chances(
-    scores: Scores, some: Sequence[Scatter], columns: Mapping[str, np.ndarray]
+    scores: Scores,
+    some: Sequence[Scatter],
+    columns: Mapping[str, np.ndarray],
+    noisier: float = 1.0,
 ) -> list[Chance]:
     """The tests of effects whose values are drawn by chance.
 
@@ -220,21 +223,25 @@ def chances(
         scores: of candidates, these among them.
         some: those to test.
         columns: effect's name -> its columns among the scores.
+        noisier: how many times wider than their sigmas the rows scatter by themselves.
     """
     found = []
     for effect in some:
         at = columns[effect.name]
         score, information = scores.score[at], scores.information[np.ix_(at, at)]
-        found.append(_of_values(effect, Told(score, information, np.zeros(len(at), int))))
+        rows = Told(score, information, np.zeros(len(at), int)).of_noisier(noisier)
+        found.append(_of_values(effect, rows))
     return [chance for chance in found if chance is not None]
 
 
-def of_lidar(some: Sequence[Scatter], blunders: Sequence[Blunder], others: Others) -> list[Chance]:
+def of_lidar(
+    some: Sequence[Scatter], blunders: Sequence[Blunder], others: Others, noisier: float = 1.0
+) -> list[Chance]:
     """The same of effects on where the LiDAR is at each stop, scans that are blunders left out;
-    arguments as of `rows_by_chance`."""
+    arguments as of `rows_by_chance` and `chances`."""
     wild = [blunder.group for blunder in blunders if blunder.found]
     rows = of_poses(others, wild) if some else None
-    found = [_of_values(effect, rows) for effect in some if rows is not None]
+    found = [_of_values(effect, rows.of_noisier(noisier)) for effect in some if rows is not None]
     return [chance for chance in found if chance is not None]
 
 

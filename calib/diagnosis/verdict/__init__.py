@@ -244,11 +244,13 @@ def _over_the_expected(
 def _unconfirmed(found: Search, over: float) -> Candidate | None:
     """Structure that single beams show, where the held-out error is larger than chance makes it and
     no structure or effect is found: so few stops, or walls, see each part of it that they may
-    differ by chance as much."""
+    differ by chance as much. None where beams scatter by themselves so widely that the error is as
+    expected of them."""
     there = (
         found.unnamed or found.found or found.at_first or not found.looks[0].stand.estimate.scans
     )
-    if there or over <= (HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE):
+    most = HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE
+    if there or over <= most or over <= most * found.looks[-1].stand.beams.alone:
         return None
     return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,6 +43,10 @@ class Told:
         information = (scaled - np.eye(len(values))) / np.outer(root, root)
         score = (scaled @ (values / root)) / root
         return cls(score, (information + information.T) / 2, group)
+
+    def of_noisier(self, times: float) -> Told:
+        """The same of rows that scatter so many times as widely as their sigmas say."""
+        return replace(self, score=self.score / times**2, information=self.information / times**2)
 
     def spread(self, start: np.ndarray) -> np.ndarray:
         """The sd (G,) of each group.

@@ -1,0 +1,103 @@
+"""Whether beams scatter each by itself: what those beside each other have in common.
+
+Where a LiDAR is noisier than its noise model says, each beam errs by itself. Where something is
+missing from the model, beams beside each other in a ring err alike, and what belongs to a direction
+of the LiDAR comes again at every stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.forward import Values
+from calib.linear.parallel import over_stops
+from calib.residuals.beams import Association
+from calib.residuals.scan import ScanStop
+from calib.results.sigmas import TOLERATED
+from calib.solve.estimate import Estimate
+
+COLUMN_RAD = np.radians(0.2)  # wide as a column of most spinning LiDARs: 1,800 or 2,048 a turn
+
+
+@dataclass(frozen=True)
+class BeamScatter:
+    """How widely beams scatter.
+
+    Args:
+        times: rms of their residuals, in their sigmas.
+        common: the share of its square that beams beside each other, or the same beam at other
+            stops, have in common, whichever is more.
+    """
+
+    times: float
+    common: float
+
+    @property
+    def alone(self) -> float:
+        """How many times wider than its sigma each beam scatters by itself."""
+        return self.times * float(np.sqrt(1.0 - self.common))
+
+    @property
+    def sentence(self) -> str:
+        """What it says, and what to do about it."""
+        beside = f"{100 * self.common:.0f} % of it is common to beams beside each other"
+        if self.alone <= TOLERATED:
+            return (
+                f"The ranges scatter {self.times:.1f} times as widely as the LiDAR's noise model "
+                f"says, and {beside}, or to the same beam at other stops: that is no noise of "
+                "single beams."
+            )
+        return (
+            f"The ranges scatter {self.alone:.1f} times as widely as the LiDAR's noise model says, "
+            f"each beam by itself ({beside}). No effect explains that, and sigmas are widened by "
+            "it; a larger sigma_range_m of the lidar in rig.yaml would say so."
+        )
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> BeamScatter:
+        """Of the beams that have weight, at an estimate with scans."""
+        stops = list(over_stops(_Residuals(estimate.values), estimate.scans, estimate.associations))
+        z, ring, column = (np.concatenate(each) for each in zip(*stops, strict=True))
+        stop = np.repeat(np.arange(len(stops)), [len(each[0]) for each in stops])
+        square = float(np.mean(np.square(z)))
+        alike = (
+            _beside(z, (stop, ring), column),
+            _beside(z, (stop, column), ring),
+            _again(z, (ring, column)),
+        )
+        return cls(float(np.sqrt(square)), float(np.clip(max(alike) / square, 0.0, 1.0)))
+
+
+def _beside(z: np.ndarray, within: Sequence[np.ndarray], along: np.ndarray) -> float:
+    """Mean product of values (N,) that follow each other along something, within the same."""
+    order = np.lexsort((along, *within))
+    here, there = order[:-1], order[1:]
+    pairs = np.all([each[here] == each[there] for each in within], axis=0)
+    return float(np.mean((z[here] * z[there])[pairs])) if pairs.any() else 0.0
+
+
+def _again(z: np.ndarray, same: Sequence[np.ndarray]) -> float:
+    """Mean product of values (N,) of which all that is the same is one."""
+    _, which, count = np.unique(np.stack(same), axis=1, return_inverse=True, return_counts=True)
+    total, squares = (np.bincount(which.ravel(), weights=x) for x in (z, np.square(z)))
+    pairs = float(np.sum(count * (count - 1.0)))
+    return float(np.sum(np.square(total) - squares)) / pairs if pairs else 0.0
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Gives a stop's residuals in sigmas, with the ring and the column of each; can be sent."""
+
+    values: Values
+
+    def __call__(
+        self, scan: ScanStop, association: Association
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rows = scan.rows(self.values, association)
+        ring, azimuth_rad = (np.asarray(rows.view[name]) for name in ("ring", "azimuth_rad"))
+        kept = rows.weight > 0
+        z = (rows.residual_m / rows.sigma_m)[kept]
+        return z, ring[kept], np.round(azimuth_rad[kept] / COLUMN_RAD).astype(int)
