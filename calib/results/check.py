@@ -144,6 +144,7 @@ class _Checker:
         if rig and recording:
             found.contents.extend(inventory.of_stops(rig, recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
+            found.odd.extend(inventory.odd_times(recording))
             found.odd.extend(inventory.odd_payloads(rig, recording))
             found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))

@@ -130,14 +130,19 @@ def _at_all_stops(pair: SeenPair) -> Suspect | None:
             return Suspect("body", names, said)
     if turns(pair, seen)[0] < TURNED_RAD:
         return None
-    orders = {order: turns(pair, pair.seen(index)) for order, index in QUATERNION_ORDERS.items()}
-    fitting = [order for order, (left, _) in orders.items() if left < FITS_RAD]
+    ways = {  # columns of all bodies, or of one of them
+        (order, of): turns(pair, pair.seen(index, of))
+        for order, index in QUATERNION_ORDERS.items()
+        for of in dict.fromkeys([pair.names, *((name,) for name in pair.names)])
+    }
+    fitting = [way for way, (left, _) in ways.items() if left < FITS_RAD]
     if not fitting:
         return None
-    order = min(fitting, key=lambda order: orders[order][1])
+    order, of = min(fitting, key=lambda way: ways[way][1])
+    names = " and ".join(of)
     said = (
-        f"{names} turn as the joints say if the columns qw, qx, qy, qz hold {order}; put them in "
-        "their order"
+        f"{names} {'turns' if len(of) == 1 else 'turn'} as the joints say if the columns qw, qx, "
+        f"qy, qz hold {order}; put them in their order"
     )
     return Suspect("body", names, said)
 

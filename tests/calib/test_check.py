@@ -13,7 +13,7 @@ from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.solution import solution_of
-from calib.rig.inventory import PlacedScan, odd_beams, odd_payloads, odd_rig
+from calib.rig.inventory import PlacedScan, odd_beams, odd_payloads, odd_rig, odd_times
 from calib.solve.fit import solve
 from chains import se3
 from chains.arm import Mass
@@ -264,6 +264,16 @@ def test_targets_that_are_mixed_up(rec):
     odd = check(rec).odd
     assert any(line.startswith("the rod of t3 does not hang as the others do") for line in odd), odd
     assert any(line.startswith("tracker and scanner place t") for line in odd), odd
+
+
+@pytest.mark.parametrize(
+    ("times", "unit"), [(1.0, None), (1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanos")]
+)
+def test_times_in_another_unit(times, unit):
+    time_s = times * (1.7e9 + np.cumsum([0.0, 90, 100, 3600, 80, 0, 70]))
+    told = list(odd_times(SimpleNamespace(timed=True, time_s=time_s)))
+    assert len(told) == (unit is not None) and all(f"is it in {unit}" in each for each in told)
+    assert list(odd_times(SimpleNamespace(timed=False, time_s=np.full(7, np.nan)))) == []
 
 
 def test_payloads_that_no_arm_carries(monkeypatch):

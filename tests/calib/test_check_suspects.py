@@ -111,6 +111,9 @@ def test_quaternions_in_another_order(sound, shared, order):
     named = {(1, 2, 3, 0): "hold qx, qy, qz, qw", (3, 0, 1, 2): "hold qz, qw, qx, qy"}[order]
     found = only(odd_bodies(rig, turned(recording, (BASE, MOUNT))))
     assert named in found.sentence and found.stops == ()
+    assert found.name == f"{BASE} and {MOUNT}"
+    found = only(odd_bodies(rig, turned(recording, [MOUNT])))
+    assert named in found.sentence and found.name == MOUNT
     rig, recording = opened(shared, "arm_base_creeps")
     found = only(odd_bodies(rig, turned(recording, recording.bodies)))
     assert named in found.sentence

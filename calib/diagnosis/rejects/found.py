@@ -83,7 +83,9 @@ class Place:
         lower, upper = scale * self.lower, scale * self.upper
         if self.covariate == "ring":
             lower, upper = np.ceil(lower), np.floor(upper)
-        return f"{words(self.covariate)} {lower:.4g} to {upper:.4g} {unit}".rstrip()
+        low, high = f"{lower:.4g}", f"{upper:.4g}"
+        ends = low if low == high else f"{low} to {high}"
+        return f"{words(self.covariate)} {ends} {unit}".rstrip()
 
     @property
     def what(self) -> str:

@@ -53,6 +53,15 @@ def test_columns_of_a_covariate_sum_to_one(name):
         assert columns.min() >= 0.0
 
 
+@pytest.mark.parametrize("size", [1e200, 1e-200, 0.0])
+def test_values_whose_squares_are_no_numbers_are_no_covariate(size):
+    """Columns that nobody measured; they ended a diagnosis with an internal fault."""
+    beams = table(1, stops=10, each=60)
+    beams.covariates["intensity"][:] *= size
+    assert "intensity" not in Bases(beams, 10).names()
+    assert "range_m" in Bases(beams, 10).names()
+
+
 def test_what_goes_round_has_no_seam():
     beams = table(1, stops=10, each=60)
     beams.covariates["azimuth_rad"][:2] = np.pi - 1e-9, -np.pi + 1e-9
