@@ -71,7 +71,7 @@ from calib.effects.range import (
     WarmupDrift,
 )
 from calib.effects.reference import FaroScale, MeshShift, MovedSurface
-from calib.effects.rig import FrameOffset, MountCreep, MountSettle, MountSlip
+from calib.effects.rig import FrameOffset, LidarSlip, MountCreep, MountSettle, MountSlip
 from calib.effects.scatter import (
     JointScatter,
     LocationRangeScatter,
@@ -137,6 +137,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmThermalGrowth(),
     BaseFlex(),
     MountSlip(),
+    LidarSlip(),
     MountCreep(),
     MountSettle(),
     MountBending(),

@@ -57,7 +57,11 @@ class MountSlip(Slips):
     sigma = np.repeat([0.001, 0.001], 3)
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return self.moves() if mount_edges(rig) else ()
+        return self.moves() if self.edge(rig) is not None else ()
+
+    def edge(self, rig: Rig) -> int | None:
+        """The edge that moves; None of a rig that has none such."""
+        return next(iter(mount_edges(rig)), None)
 
     def moves(self) -> tuple[Param, ...]:
         """The six of one frame."""
@@ -71,7 +75,7 @@ class MountSlip(Slips):
     def moved(self, view: View, by: np.ndarray) -> np.ndarray:
         """The basis where so much (K,) of each motion has happened at each stop."""
         basis = np.zeros((len(by), len(view.rig.tree.edges), 6, 6))
-        basis[:, mount_edges(view.rig)[0]] = by[:, None, None] * np.eye(6)
+        basis[:, self.edge(view.rig)] = by[:, None, None] * np.eye(6)
         return basis
 
 
@@ -93,6 +97,27 @@ class MountSettle(Settles, MountSlip):
     formula = "T_tip_mount = T_cad exp(theta * (1 - exp(-t / tau))), t since the first stop"
     typical = "0.1 to 1 mm, 0.1 to 1 mrad, size assumed; printed resin and rubber relax"
     confounded_with = ("mount_creep", "mount_slip", "warmup_drift")
+
+
+class LidarSlip(MountSlip):
+    """The LiDAR slips once on its mount, and stays where it slipped to; or its azimuth is counted
+    from elsewhere.
+
+    Tracked bodies on the mount stay where they are. Where there are none it is `MountSlip`.
+    """
+
+    name = "lidar_slip"
+    formula = "T_mount_lidar = T_cad exp(theta) where t > t*, t since the first stop"
+    confounded_with = ("mount_slip", "body_slip", "ring_azimuth_offset")
+
+    def edge(self, rig: Rig) -> int | None:
+        mount, lidar = super().edge(rig), rig.lidar_frame
+        bodies = rig.tracker.bodies if rig.tracker else ()
+        if mount is None or not lidar or not rig.tree.path(lidar):
+            return None
+        own = rig.tree.path(lidar)[-1]
+        beside = (b for b in bodies if mount in rig.tree.path(b) and own not in rig.tree.path(b))
+        return own if own != mount and any(beside) else None
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

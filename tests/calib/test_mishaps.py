@@ -23,15 +23,15 @@ SPEC = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=3, column_
 STOP = "L01P01"  # row 4 of stops.csv
 
 
-def turned(angle_rad):
+def turned(angle_rad, stop=STOP):
     """The scan of that stop, turned about the LiDAR's axis."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
 
     def apply(rec):
-        table = read_table(rec / f"scans/{STOP}.parquet")
+        table = read_table(rec / f"scans/{stop}.parquet")
         x, y = table["x"], table["y"]
         table |= {"x": (c * x - s * y).astype("f4"), "y": (s * x + c * y).astype("f4")}
-        write_table(rec / f"scans/{STOP}.parquet", table)
+        write_table(rec / f"scans/{stop}.parquet", table)
 
     return apply
 
@@ -103,6 +103,20 @@ def test_what_slips_late_is_one_effect_and_not_a_mishap_at_every_stop_after_it(t
     (step,) = found.found
     assert step.effect.family == "arm_joint_slip" and not found.blunders
     assert times_s[-4] < step.effect.shape < times_s[-3]
+
+
+@pytest.mark.slow
+def test_a_lidar_that_turned_on_its_mount_from_a_stop_on_is_that_and_no_joint(tmp_path):
+    """It was told as a joint and a body that slipped, each making up for the other."""
+    spec = SPEC.model_copy(update={"locations": 5, "column_step": 100})
+    simulate(spec, tmp_path / "rec", 2)
+    recording = Source.open(tmp_path / "rec").recording
+    for stop in recording.stops[8:]:
+        turned(0.006, stop)(tmp_path / "rec")
+    (step,) = searched(tmp_path / "rec").found
+    assert step.effect.family == "lidar_slip"
+    times_s = recording.time_s - recording.time_s[0]
+    assert times_s[7] < step.effect.shape < times_s[8]
 
 
 def test_mishaps_of_two_stops_are_no_effect(recording, tmp_path):

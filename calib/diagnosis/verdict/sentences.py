@@ -20,6 +20,7 @@ MOST_LISTED = 6  # untestable effects and rivals that a sentence names
 # What moves, by what `diagnosis.json` calls it, as a sentence names it.
 WHAT_MOVES = {
     "mount": "the mount",
+    "lidar": "the LiDAR on its mount",
     "body": "the tracked body beyond the arm",
     "base": "the tracked body before the arm",
     "tracker": "the tracker, or the place where the base stands,",
