@@ -190,11 +190,14 @@ def known_effects(
 
 
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
-    """Whether a rig has the instrument that an effect is about: an arm under a tracker alone lacks
-    nothing of a LiDAR, a scanner or targets."""
+    """Whether a rig has the instrument, or the joints, that an effect is about: an arm under a
+    tracker alone lacks nothing of a LiDAR, a scanner or targets, and one that turns none of rails.
+    """
     rigs = [s.rig for s in sources]
-    if effect.site in (Site.BEAM, Site.NOISE):
+    if effect.site in (Site.BEAM, Site.NOISE) or effect.about == "lidar":
         return any(rig.lidar for rig in rigs)
+    if effect.about:
+        return any(effect.about in rig.joint_kinds for rig in rigs)
     if effect.site is Site.REFERENCE:
         return any(rig.reference or rig.lidar for rig in rigs)
     return effect.site is not Site.TARGET or any(rig.target for rig in rigs)

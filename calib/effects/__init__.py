@@ -22,6 +22,7 @@ from calib.effects.arm import (
     ArmJointSlip,
     ArmJointThermal,
     ArmLinkLength,
+    ArmRailBending,
     ArmThermalGrowth,
 )
 from calib.effects.base import (
@@ -126,6 +127,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmAxisTilt(),
     ArmGeometry(),
     ArmJointScale(),
+    ArmRailBending(),
     ArmJointEccentricity(),
     ArmGravitySag(),
     ArmPayloadSag(),

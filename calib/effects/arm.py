@@ -10,6 +10,7 @@ from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import Creeps, Settles, Slips, finite
 from calib.effects.range import AMBIENT_C
 from calib.rig import Rig
+from chains.frames import Edge
 from chains.minimal import Own, across, own_errors
 
 
@@ -166,6 +167,51 @@ def _own(rig: Rig) -> Own:
     return own_errors(rig.tree, rig.chains, base_held, tips_held)
 
 
+class ArmRailBending(Effect):
+    """The rail of a sliding joint is bent: an arc in either plane along it, and a steady twist.
+
+    Beams of gantries sag under what slides on them, and rails follow what they are screwed to.
+    Where the joint has gone by q, the arc turns what slides by k q and shifts it by k q^2 / 2.
+    """
+
+    name = "arm_rail_bending"
+    about = "prismatic"
+    site = Site.EDGE
+    unit = "rad/m"
+    formula = "T(q) -> T(q) * exp(turn k q across, shift k q^2 / 2 across; turn t q about the axis)"
+    typical = "0.02 to 0.4 mrad per metre: a beam of 3 m that sags by 0.02 to 0.4 mm"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_scale", "optitrack_distortion", "arm_axis_tilt")
+    source = "ISO 230-1: straightness and angular deviations of linear axes; size assumed"
+    sigma = 0.0003
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(
+            Param(f"{edge.joint.name}.{way}", self.unit, self.sigma)
+            for edge in _rails(rig)
+            for way in ("bend_a", "bend_b", "twist")
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        rig, rails = view.rig, _rails(view.rig)
+        basis = np.zeros((len(view.joints), len(rig.tree.edges), 6, 3 * len(rails)))
+        for r, edge in enumerate(rails):
+            e, axis = rig.tree.edge_names.index(edge.name), edge.joint.axis
+            q = view.joints[:, rig.joint_names.index(edge.joint.name), None]
+            for p, way in enumerate(across(axis).T, start=3 * r):
+                # Seen from before the joint moves, the turn itself shifts, by q x turn.
+                basis[:, e, :3, p] = q * np.cross(axis, way)
+                basis[:, e, 3:, p] = -np.square(q) / 2 * way
+            basis[:, e, :3, 3 * r + 2] = q * axis
+        return basis
+
+
+def _rails(rig: Rig) -> list[Edge]:
+    """The edges of sliding joints that are read."""
+    sliding = (e for e in rig.tree.edges if e.joint is not None and e.joint.kind == "prismatic")
+    return [e for e in sliding if e.joint.leads and e.joint.name in rig.joint_names]
+
+
 class ArmJointScale(Effect):
     """An encoder counts too many steps a turn: ``true joint = reported * (1 + k)``."""
 
@@ -189,6 +235,7 @@ class ArmJointEccentricity(Effect):
     """A joint's encoder disc sits off its axis: the angle errs once a turn."""
 
     name = "arm_joint_eccentricity"
+    about = "revolute"
     site = Site.JOINTS
     unit = "rad"
     formula = "q_i = reported_i + a_i * sin(reported_i) + b_i * cos(reported_i)"
