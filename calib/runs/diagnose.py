@@ -123,7 +123,7 @@ def _found(
             *result.sentences,
             *(told.uneven(last.blunders) if run.converged else ()),
             *hardly_checked(unseen),
-            *_noisier(run, stand),
+            *_noisier(run, stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),
             *run.omissions,
         ],
@@ -240,10 +240,13 @@ def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
     yield from (each for each in told.not_as_drawn(moved) if each["name"] not in named)
 
 
-def _noisier(run: Run, stand: Stand) -> list[str]:
-    """That beams scatter more than the noise model of the LiDAR says."""
-    noisier = run.summary["misfit"].get("beams", 0.0) > TOLERATED
-    return [stand.beams.sentence] if noisier else []
+def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
+    """That beams scatter more than the noise model of the LiDAR says; of what they have in common
+    nothing where something was found that explains it."""
+    if run.summary["misfit"].get("beams", 0.0) <= TOLERATED:
+        return []
+    told = stand.beams.alone > TOLERATED or not explained
+    return [stand.beams.sentence] if told else []
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
