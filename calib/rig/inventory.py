@@ -31,7 +31,7 @@ LIGHTEST, HEAVIEST = 1.3, 1430.0
 HEAVIEST_LOAD_KG = 2300.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
-FINER = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}  # of a second
+FINER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}  # of a second
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
 
@@ -166,7 +166,7 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
     gaps_s = np.diff(np.sort(recording.time_s)) if recording.timed else np.zeros(0)
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0
     if usual_s > SLOWEST_S:
-        units = (name for name, times in FINER.items() if usual_s / times < SLOWEST_S)
+        units = (name for name, times in FINER_UNITS.items() if usual_s / times < SLOWEST_S)
         unit = next(units, "a finer unit")
         yield (
             f"by time_s in stops.csv it takes {usual_s / 3600:.3g} h from one stop to the next "
