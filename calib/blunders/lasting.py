@@ -3,36 +3,48 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from calib.blunders.chance import at_least
 from calib.blunders.judged import LeftOut
 from calib.blunders.told import size_told
 from calib.problem.model import Source, labels
-from calib.residuals.groups import JOINTS
+from calib.residuals.groups import JOINTS, Group
 from calib.rig.suspect import Spell, spells
 
 
-def lasting(found: Sequence[LeftOut], sources: Sequence[Source]) -> Iterator[dict[str, Any]]:
+def lasting(
+    found: Sequence[LeftOut], looked_at: Iterable[Group], sources: Sequence[Source]
+) -> Iterator[dict[str, Any]]:
     """Blunders of one scan, body or joint at stops that follow each other, as diagnosis.json has
     them: each by itself would hardly lie so.
 
     Args:
         found: the blunders.
+        looked_at: all groups of rows that might be some.
         sources: the recordings that they are in.
     """
     by_what: dict[tuple[str, str, str], dict[str, LeftOut]] = {}
     for left in found:
-        group = left.blunder.group
-        if group.stop is not None:
-            at_stops = by_what.setdefault((group.recording, group.kind, group.what), {})
-            at_stops[group.stop] = left
+        if left.blunder.group.stop is not None:
+            at_stops = by_what.setdefault(_wherever(left.blunder.group), {})
+            at_stops[left.blunder.group.stop] = left
+    there = {what: {*at_stops} for what, at_stops in by_what.items()}
+    for group in looked_at:
+        there.get(_wherever(group), set()).add(str(group.stop))
     of = dict(zip(labels(sources), sources, strict=True))
-    for (recording, _, _), at_stops in by_what.items():
-        stops = of.get(recording, sources[0]).recording
-        for spell in spells(stops.stops, stops.time_s, at_stops):
+    for what, at_stops in by_what.items():
+        recording = of.get(what[0], sources[0]).recording
+        seen = [k for k, stop in enumerate(recording.stops) if stop in there[what]]
+        stops = [recording.stops[k] for k in seen]
+        for spell in spells(stops, recording.time_s[seen], at_stops):
             yield _document(spell, [at_stops[stop] for stop in spell.wrong])
+
+
+def _wherever(group: Group) -> tuple[str, str, str]:
+    """What of a recording it is, at whichever stop."""
+    return group.recording, group.kind, group.what
 
 
 def told_once(
@@ -67,11 +79,11 @@ def _sentence(spell: Spell, found: Sequence[LeftOut]) -> str:
     )
     rivals = " or ".join(_in_common(found))
     either = f"; or it is {rivals}: nothing measured here tells them apart" if rivals else ""
+    verb = "are" if group.what == JOINTS else "is"
     return (
-        f"{where[0].upper()}{where[1:]} {group.named} {'are' if group.what == JOINTS else 'is'} "
-        f"off{off}, against everything else{either}. Something changed {spell.since} and lasts: "
-        "stops that are wrong each by itself would hardly follow each other so "
-        f"(p = {at_least(spell.p_value):.1g})."
+        f"{where[0].upper()}{where[1:]} {group.named} {verb} off{off}, against everything "
+        f"else{either}. This {spell.course}: stops that are wrong each by itself would hardly "
+        f"follow each other so (p = {at_least(spell.p_value):.1g})."
     )
 
 

@@ -190,14 +190,14 @@ def known_effects(
 
 
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
-    """Whether a rig has the instrument, or the joints, that an effect is about: an arm under a
-    tracker alone lacks nothing of a LiDAR, a scanner or targets, and one that turns none of rails.
-    """
+    """Whether a rig has the instrument, or the kind of joint, that an effect is about: an arm under
+    a tracker alone lacks nothing of a LiDAR, a scanner or targets, and one without sliding joints
+    nothing of rails."""
     rigs = [s.rig for s in sources]
-    if effect.site in (Site.BEAM, Site.NOISE) or effect.about == "lidar":
+    if effect.site in (Site.BEAM, Site.NOISE) or effect.needs_lidar:
         return any(rig.lidar for rig in rigs)
-    if effect.about:
-        return any(effect.about in rig.joint_kinds for rig in rigs)
+    if effect.joint_kind:
+        return any(effect.joint_kind in rig.joint_kinds for rig in rigs)
     if effect.site is Site.REFERENCE:
         return any(rig.reference or rig.lidar for rig in rigs)
     return effect.site is not Site.TARGET or any(rig.target for rig in rigs)

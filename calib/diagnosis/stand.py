@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -130,13 +130,16 @@ class Stand:
         named = screen(scores, named, at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
+        values = chances(scores, chance, at)
+        if any(c.found for c in values):  # of beams that are noisier, means scatter more as well
+            values = chances(scores, chance, at, max(1.0, self.beams.alone))
         return Look(
             stand=self,
             linear=linear,
             named=named,
             unnamed=rest,
             noise=noise,
-            values=beside_noise(partial(chances, scores, chance, at), self),
+            values=values,
             by_rows=by_rows,
             columns=columns,
         )
@@ -209,19 +212,6 @@ def _own_columns(scan: ScanStop) -> tuple[str, ...]:
     return (*scan.recording.covariates, *scan.store.read(first)[0].extra)
 
 
-def beside_noise(test: Callable[[float], list[Chance]], stand: Stand) -> list[Chance]:
-    """What scatters by chance, beyond what beams do by themselves: where they are noisier than
-    stated, the mean of those of a stop scatters more as well.
-
-    Args:
-        test: gives it, where beams scatter so many times as widely as stated.
-        stand: a fit.
-    """
-    found = test(1.0)
-    noisier = any(c.found for c in found) and stand.estimate.scans and stand.beams.alone
-    return test(noisier) if noisier > 1.0 else found
-
-
 @dataclass(frozen=True)
 class Look:
     """What the rows say from where a fit stands.
@@ -272,7 +262,7 @@ class Look:
         wider = [e for e in self.by_rows if e.widens]
         posed = [e for e in self.by_rows if not e.widens]
         of_rows = rows_by_chance(wider, self.blunders, self.others)
-        of_poses = beside_noise(partial(of_lidar, posed, self.blunders, self.others), self.stand)
+        of_poses = of_lidar(posed, self.blunders, self.others)
         return ranked([*self.values, *of_poses, *of_rows])
 
     def still(self, some: Sequence[Chance]) -> list[Chance]:

@@ -175,10 +175,13 @@ class ArmRailBending(Effect):
     """
 
     name = "arm_rail_bending"
-    about = "prismatic"
+    joint_kind = "prismatic"
     site = Site.EDGE
     unit = "rad/m"
-    formula = "T(q) -> T(q) * exp(turn k q across, shift k q^2 / 2 across; turn t q about the axis)"
+    formula = (
+        "T(q) -> T(q) * exp(shift k q^2 / 2 across the axis, turn k q about what is across both; "
+        "turn t q about the axis)"
+    )
     typical = "0.02 to 0.4 mrad per metre: a beam of 3 m that sags by 0.02 to 0.4 mm"
     covariates = ("joints",)
     confounded_with = ("arm_joint_scale", "optitrack_distortion", "arm_axis_tilt")
@@ -209,7 +212,8 @@ class ArmRailBending(Effect):
 def _rails(rig: Rig) -> list[Edge]:
     """The edges of sliding joints that are read."""
     sliding = (e for e in rig.tree.edges if e.joint is not None and e.joint.kind == "prismatic")
-    return [e for e in sliding if e.joint.leads and e.joint.name in rig.joint_names]
+    unread = rig.passive
+    return [e for e in sliding if e.joint.leads and e.joint.name not in unread]
 
 
 class ArmJointScale(Effect):
@@ -235,7 +239,7 @@ class ArmJointEccentricity(Effect):
     """A joint's encoder disc sits off its axis: the angle errs once a turn."""
 
     name = "arm_joint_eccentricity"
-    about = "revolute"
+    joint_kind = "revolute"
     site = Site.JOINTS
     unit = "rad"
     formula = "q_i = reported_i + a_i * sin(reported_i) + b_i * cos(reported_i)"

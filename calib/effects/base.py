@@ -131,8 +131,8 @@ class Effect(ABC):
         whole: True where a shape is a whole number.
         jumps: True where the basis jumps with the shape, as at the time when something slipped.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
-        about: the only kind of joints that it is about, "revolute" or "prismatic", or "lidar" of an
-            effect at another site that is about one: a rig without them lacks nothing of it.
+        joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
+        needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
         of_volume: True where it is the tracker's error at a place, which markers of targets have as
             well.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
@@ -155,7 +155,8 @@ class Effect(ABC):
     shape: float = 0.0
     whole: ClassVar[bool] = False
     jumps: ClassVar[bool] = False
-    about: ClassVar[str] = ""
+    joint_kind: ClassVar[str] = ""
+    needs_lidar: ClassVar[bool] = False
     of_volume: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
     widens: ClassVar[bool] = False

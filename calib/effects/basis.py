@@ -69,6 +69,11 @@ def _between(stops: View) -> np.ndarray:
     return (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
 
 
+def settled(elapsed_s: np.ndarray, tau_s: float) -> np.ndarray:
+    """How much (K,) has happened of what is fast at first, and then ever slower."""
+    return 1.0 - np.exp(-elapsed_s / tau_s)
+
+
 class Slips(Effect):
     """What happens once, at a time t_s since the first stop, and then stays."""
 
@@ -117,4 +122,4 @@ class Settles(Effect):
 
     def when(self, elapsed_s: np.ndarray) -> np.ndarray:
         """How much of it has happened (K,) at times since the first stop."""
-        return 1.0 - np.exp(-elapsed_s / self.shape)
+        return settled(elapsed_s, self.shape)

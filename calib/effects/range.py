@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, OneHot, Param, Site, View
-from calib.effects.basis import RANGE, beam, finite, incidence_rad, place_of, range_m
+from calib.effects.basis import RANGE, beam, finite, incidence_rad, place_of, range_m, settled
 from calib.rig import Rig
 
 STUDY = "Pushing the Limits of LiDAR: Accurate Performance Analysis of Indoor 3D LiDARs"
@@ -218,7 +218,7 @@ class WarmupDrift(RangeEffect):
         return (120.0, 240.0, 480.0, 900.0, 1800.0, 3600.0)
 
     def column(self, view: View) -> np.ndarray:
-        return 1.0 - np.exp(-view["elapsed_s"] / self.shape)
+        return settled(view["elapsed_s"], self.shape)
 
 
 class TemperatureDrift(RangeEffect):

@@ -107,7 +107,7 @@ class LidarSlip(MountSlip):
     """
 
     name = "lidar_slip"
-    about = "lidar"
+    needs_lidar = True
     formula = "T_mount_lidar = T_cad exp(theta) where t > t*, t since the first stop"
     confounded_with = ("mount_slip", "body_slip", "ring_azimuth_offset")
 

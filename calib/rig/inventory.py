@@ -31,7 +31,13 @@ LIGHTEST, HEAVIEST = 1.3, 1430.0
 HEAVIEST_LOAD_KG = 2300.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
-FINER_UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}  # of a second
+FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
+# How many there are in a second, and below which number they are the unit of a date.
+FINER_UNITS = {
+    "milliseconds": (1e3, 1e13),
+    "microseconds": (1e6, 1e16),
+    "nanoseconds": (1e9, np.inf),
+}
 COARSE_M = 0.05  # no instrument here is as bad as that
 FAR_OFF_M = 0.3  # median residual at the start: more than CAD is wrong by
 
@@ -165,12 +171,15 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
     """Times in another unit than seconds."""
     gaps_s = np.diff(np.sort(recording.time_s)) if recording.timed else np.zeros(0)
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0
-    if usual_s > SLOWEST_S:
-        units = (name for name, times in FINER_UNITS.items() if usual_s / times < SLOWEST_S)
-        unit = next(units, "a finer unit")
+    last_s = float(np.max(recording.time_s)) if recording.timed else 0.0
+    if last_s > LAST_DATE_S:
+        unit = next(name for name, (_, until_s) in FINER_UNITS.items() if last_s < until_s)
+        yield f"time_s in stops.csv goes up to {last_s:.3g} s: is it in {unit} since 1970?"
+    elif usual_s > SLOWEST_S and last_s < FIRST_DATE_S:
+        units = (name for name, (times, _) in FINER_UNITS.items() if usual_s / times < SLOWEST_S)
         yield (
             f"by time_s in stops.csv it takes {usual_s / 3600:.3g} h from one stop to the next "
-            f"(median); time_s is in seconds: is it in {unit}?"
+            f"(median); time_s is in seconds: is it in {next(units, 'a finer unit')}?"
         )
 
 

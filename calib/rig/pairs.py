@@ -21,6 +21,7 @@ MOST_COMPARED = 100  # stops, each with each
 # Of the stops of a place, which agree where it is: a choice, below half, as half of a table may be
 # out of step.
 AGREE = 0.3
+MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 
 
 @dataclass(frozen=True)
@@ -171,3 +172,21 @@ def gap_of(a: Array, b: Array) -> Array:
 def size_of(twist: Array) -> Array:
     """Rad and m alike: (...,) how large a twist is."""
     return np.linalg.norm(twist, axis=-1)
+
+
+def robustly_left(A: Array, b: Array) -> tuple[Array, float]:
+    """What is left of b (K, 6) after A (K, 6, P), of unknowns with a sigma of 1, and which share
+    of the rows they took on: the mean diagonal of what makes fitted rows of seen ones."""
+    some = slice(None, None, -(-len(b) // MOST_FITTED))
+    rows, seen, P = A[some].reshape(-1, A.shape[2]), b[some], A.shape[2]
+    weight = np.ones(len(seen))
+    for _ in range(30):
+        weighted = rows * np.repeat(weight, 6)[:, None]
+        inner = rows.T @ weighted
+        x = np.linalg.solve(inner + np.eye(P), weighted.T @ seen.ravel())
+        size = np.linalg.norm(seen - (rows @ x).reshape(-1, 6), axis=1)
+        before, weight = weight, 1.0 / (1.0 + np.square(size / max(3.0 * np.median(size), 3.0)))
+        if np.abs(weight - before).max() < 1e-3:
+            break
+    taken = float(np.trace(np.linalg.solve(inner + np.eye(P), inner))) / len(rows)
+    return b - A @ x, taken

@@ -56,10 +56,13 @@ class Spell:
     p_value: float
 
     @property
-    def since(self) -> str:
-        """Between which stops something changed."""
-        ends = zip((self.before, self.stops[-1]), (self.stops[0], self.after), strict=True)
-        return " and ".join(f"between {a} and {b}" for a, b in ends if a and b)
+    def course(self) -> str:
+        """When it began and ended, by the stops between which it did."""
+        began = f"began between {self.before} and {self.stops[0]}" if self.before else ""
+        ended = f"ended between {self.stops[-1]} and {self.after}" if self.after else ""
+        if not ended:
+            return f"{began} and lasts to the end"
+        return f"{began} and {ended}" if began else f"was there from the first stop and {ended}"
 
     def __str__(self) -> str:
         most = len(self.wrong) < len(self.stops)
@@ -72,23 +75,22 @@ def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> 
 
     Of m stops among n that are each wrong by themselves, k or more lie within w that follow each
     other with the hypergeometric tail; there are n - w + 1 such spans of each of n lengths
-    (Bonferroni).
+    (Bonferroni). The next span is sought among the stops beside it.
 
     Args:
-        stops: names.
+        stops: names of those at which it might be.
         time_s: (n,) of each; where one has none, the order of rows counts.
-        wrong: names of those that are.
+        wrong: names of those at which it is.
     """
     if len(wrong) < 3:  # of two no span is significant, however many stops there are
         return []
     from scipy.stats import hypergeom
 
-    n, out = len(stops), []
-    order = np.argsort(time_s, kind="stable") if np.isfinite(time_s).all() else np.arange(n)
-    names = [stops[k] for k in order]
+    order = np.argsort(time_s, kind="stable") if np.isfinite(time_s).all() else range(len(stops))
+    names, out = [stops[k] for k in order], []
     bad = np.isin(names, [*wrong])
     while bad.sum() > 2:
-        edges = np.diff(bad.astype(int), prepend=0, append=0)
+        n, edges = len(names), np.diff(bad.astype(int), prepend=0, append=0)
         first, end = np.flatnonzero(edges == 1)[:, None], np.flatnonzero(edges == -1)[None, :]
         width, sums = end - first, np.concatenate([[0], np.cumsum(bad)])
         tail = hypergeom.sf(sums[end] - sums[first] - 1, n, bad.sum(), width)
@@ -105,7 +107,7 @@ def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> 
             p_value=float(p[i, j]),
         )
         out.append(spell)
-        bad[a:b] = False
+        names, bad = [*names[:a], *names[b:]], np.concatenate([bad[:a], bad[b:]])
     return out
 
 

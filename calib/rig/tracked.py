@@ -20,6 +20,7 @@ from calib.rig.pairs import (
     from_places,
     gap_of,
     pairs_of,
+    robustly_left,
     roots_of,
     size_of,
     turns,
@@ -42,11 +43,12 @@ MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of th
 # choice, as one in ten was left where columns were moved back, and all where they were not.
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
-ITS_ROW = "; look at its row"
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
-MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
 QUATERNION_ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
+
+
+_Met = list[tuple[SeenPair, Array, bool]]  # pairs at a stop, how far off, whether if exchanged
 
 
 def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
@@ -57,8 +59,7 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
     for body in rig.tracker.bodies:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
-    met: dict[int, list[tuple[SeenPair, Array, bool]]] = {}
-    pairs: list[SeenPair] = []
+    met: dict[int, _Met] = {}
     for pair in pairs_of(rig, recording, usable):
         wrong = _at_all_stops(pair) or _misread(rig, recording, pair)
         if wrong is not None:
@@ -66,16 +67,15 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
             return
         told = yield from _of_some_rows(rig, recording, pair)
         pair = pair.some(~np.isin(pair.stops, [*told]))
-        pairs.append(pair)
         for k, gap, exchanged in _outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
-    by_body: dict[tuple[str, bool], dict[str, Suspect]] = {}
+    at_stops: dict[tuple[str, bool], dict[str, tuple[Suspect, _Met]]] = {}
     for stop, found in sorted(met.items()):
         name = recording.stops[stop]
-        one = _at_one_stop(rig, name, found)
-        by_body.setdefault((one.name, found[0][2]), {})[name] = one
-    for at_stops in by_body.values():
-        yield from _those_that_last(rig, recording, pairs, at_stops)
+        one = _at_one_stop(rig, f"at {name}", found, (name,))
+        at_stops.setdefault((one.name, found[0][2]), {})[name] = one, found
+    for some in at_stops.values():
+        yield from _those_that_last(rig, recording, some)
 
 
 # --------------------------------------------------------------------------------- placeholders
@@ -172,11 +172,19 @@ def _for_a_while(
 ) -> Generator[Suspect, None, set[int]]:
     """Columns exchanged or read otherwise at stops that follow each other; returns at which."""
     found: set[int] = set()
-    for spell in spells(recording.stops, recording.time_s, [recording.stops[k] for k in off]):
+    for spell in _spells(recording, [pair], [recording.stops[k] for k in off]):
         if one := _as_one(rig, recording, pair, spell):
             yield one
             found.update(np.flatnonzero(np.isin(recording.stops, spell.stops)).tolist())
     return found
+
+
+def _spells(
+    recording: RecordedStops, pairs: Sequence[SeenPair], wrong: Sequence[str]
+) -> list[Spell]:
+    """Of the stops at which the bodies of some pairs are seen."""
+    seen = np.unique(np.concatenate([pair.stops for pair in pairs]))
+    return spells([recording.stops[k] for k in seen], recording.time_s[seen], wrong)
 
 
 def _as_one(rig: Rig, recording: RecordedStops, pair: SeenPair, spell: Spell) -> Suspect | None:
@@ -184,6 +192,7 @@ def _as_one(rig: Rig, recording: RecordedStops, pair: SeenPair, spell: Spell) ->
     all."""
     there = pair.some(np.isin(pair.stops, np.flatnonzero(np.isin(recording.stops, spell.stops))))
     one = _at_all_stops(there) or _misread(rig, recording, there)
+    # Columns that are read otherwise are so at all of them, also where it hardly shows.
     return one and replace(one, sentence=f"{spell} {one.sentence}", stops=spell.stops)
 
 
@@ -315,7 +324,7 @@ def _outliers(rig: Rig, pair: SeenPair) -> Iterator[tuple[int, Array, bool]]:
     A = np.concatenate(columns, axis=2) / noise[:, None]
     prior = np.full(A.shape[2], NOT_THIS_ARM)
     prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
-    left, taken = _robust(A * prior, gap / noise)
+    left, taken = robustly_left(A * prior, gap / noise)
     size = np.array([np.linalg.norm(left[:, s], axis=1) for s in _HALVES]).T
     spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
     if taken > MOST_TAKEN or (spread * noise[[0, 3]] > NOT_THIS_ARM).any():
@@ -341,57 +350,42 @@ def _edge_sigmas(rig: Rig) -> Array:
     return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond
 
 
-def _robust(A: Array, b: Array) -> tuple[Array, float]:
-    """What is left of b (K, 6) after A (K, 6, P), of unknowns with a sigma of 1, and which share
-    of the rows they took on: the mean diagonal of what makes fitted rows of seen ones."""
-    some = slice(None, None, -(-len(b) // MOST_FITTED))
-    rows, seen, P = A[some].reshape(-1, A.shape[2]), b[some], A.shape[2]
-    weight = np.ones(len(seen))
-    for _ in range(30):
-        weighted = rows * np.repeat(weight, 6)[:, None]
-        inner = rows.T @ weighted
-        x = np.linalg.solve(inner + np.eye(P), weighted.T @ seen.ravel())
-        size = np.linalg.norm(seen - (rows @ x).reshape(-1, 6), axis=1)
-        before, weight = weight, 1.0 / (1.0 + np.square(size / max(3.0 * np.median(size), 3.0)))
-        if np.abs(weight - before).max() < 1e-3:
-            break
-    taken = float(np.trace(np.linalg.solve(inner + np.eye(P), inner))) / len(rows)
-    return b - A @ x, taken
-
-
 def _those_that_last(
-    rig: Rig, recording: RecordedStops, pairs: Sequence[SeenPair], at_stops: Mapping[str, Suspect]
+    rig: Rig, recording: RecordedStops, at_stops: Mapping[str, tuple[Suspect, _Met]]
 ) -> Iterator[Suspect]:
     """What is wrong with a body at stops, and once for those that follow each other."""
-    alone = dict(at_stops)
-    for spell in spells(recording.stops, recording.time_s, [*at_stops]):
+    alone = {stop: one for stop, (one, _) in at_stops.items()}
+    pairs = {pair.names: pair for _, met in at_stops.values() for pair, *_ in met}
+    for spell in _spells(recording, [*pairs.values()], [*at_stops]):
         found = [alone.pop(stop) for stop in spell.wrong]
-        as_one = (_as_one(rig, recording, pair, spell) for pair in pairs)
+        as_one = (_as_one(rig, recording, pair, spell) for pair in pairs.values())
         if one := next(filter(None, as_one), None):
             yield one
             continue
-        worst = max(found, key=lambda one: one.size or 0.0)
-        (where,) = worst.stops
-        said = worst.sentence.removeprefix(f"at {where} ")
-        if said.endswith(ITS_ROW):
-            said = f"{said.removesuffix(ITS_ROW)}, most of all at {where}"
-        said = f"{spell} {said}; look at what changed {spell.since}"
-        yield replace(worst, sentence=said, stops=spell.wrong)
+        (worst,) = max(found, key=lambda one: one.size or 0.0).stops
+        where = f"{spell}, most of all at {worst},"
+        yield _at_one_stop(rig, where, at_stops[worst][1], spell.wrong, f"this {spell.course}")
     yield from alone.values()
 
 
-def _at_one_stop(rig: Rig, stop: str, found: list[tuple[SeenPair, Array, bool]]) -> Suspect:
+def _at_one_stop(
+    rig: Rig,
+    where: str,
+    found: _Met,
+    stops: tuple[str, ...],
+    look: str = "look at its row",
+) -> Suspect:
     """One stop's bodies that stand out: the one that all pairs have in common, if there is one."""
     pair, gap, exchanged = found[0]
     common = [name for name in pair.names if all(name in other.names for other, *_ in found)]
     names = " or ".join(common or dict.fromkeys(n for p, *_ in found for n in p.names))
     turn_deg, shift_mm = np.degrees(np.linalg.norm(gap[:3])), 1e3 * np.linalg.norm(gap[3:])
     if exchanged:
-        said = f"at {stop} {' and '.join(pair.names)} lie as at other stops if they are exchanged"
+        said = f"{where} {' and '.join(pair.names)} lie as at other stops if they are exchanged"
     else:
         joints = any(rig.joints_to(name) for p, *_ in found for name in p.names)
         said = (
-            f"at {stop} {names} is {shift_mm:.3g} mm and {turn_deg:.2g} deg from where other stops"
-            f"{' and the joints' if joints else ''} put it{ITS_ROW}"
+            f"{where} {names} is {shift_mm:.3g} mm and {turn_deg:.2g} deg from where other stops"
+            f"{' and the joints' if joints else ''} put it; {look}"
         )
-    return Suspect("body", names, said, stops=(stop,), size=float(shift_mm / 1e3), unit="m")
+    return Suspect("body", names, said, stops=stops, size=float(shift_mm / 1e3), unit="m")

@@ -123,7 +123,7 @@ def _found(
             *result.sentences,
             *(told.uneven(last.blunders) if run.converged else ()),
             *hardly_checked(unseen),
-            *_noisier(run, stand, bool(found.found or formulas.formulas)),
+            *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),
             *run.omissions,
         ],
@@ -241,12 +241,12 @@ def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
 
 
 def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
-    """That beams scatter more than the noise model of the LiDAR says; of what they have in common
-    nothing where something was found that explains it."""
-    if run.summary["misfit"].get("beams", 0.0) <= TOLERATED:
+    """That beams scatter more than the noise model of the LiDAR says, with what was found in the
+    model; of what they have in common nothing where something was found."""
+    noisier = run.converged and run.summary["misfit"].get("beams", 0.0) > TOLERATED
+    if not noisier or max(stand.beams.alone, 0.0 if explained else stand.beams.times) <= TOLERATED:
         return []
-    told = stand.beams.alone > TOLERATED or not explained
-    return [stand.beams.sentence] if told else []
+    return [stand.beams.sentence]
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,7 +90,7 @@ def print_explanation(explanation: Explanation) -> None:
     for path in explanation.kept:
         console.print(f"Kept for other recordings ('rigcal fit --effects'): {path}")
     console.print()
-    _say_found(console, explanation.diagnosis)
+    _say_found(console, explanation.diagnosis, explanation.refused)
     last = runs[-1].summary
     kind = "held_out" if last["rms_mm"].get("held_out") is not None else "fit"
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]
@@ -112,12 +112,13 @@ def _say_verdict(console: Console, diagnosis: Diagnosis) -> None:
     _say_found(console, diagnosis)
 
 
-def _say_found(console: Console, diagnosis: Diagnosis) -> None:
-    """What a diagnosis found, and the command that it leads to."""
+def _say_found(console: Console, diagnosis: Diagnosis, refused: Collection[str] = ()) -> None:
+    """What a diagnosis found, and the command that it leads to, but to add what was refused."""
     for sentence in diagnosis.sentences:
         console.print(sentence)
     console.print()
-    if diagnosis.command:
+    names = {*diagnosis.worth_adding, *diagnosis.formulas}
+    if diagnosis.command and (diagnosis.blunders or names.isdisjoint(refused)):
         what = LEAVE_OUT if diagnosis.blunders else "Add it to the model:"
         print_command(console, diagnosis.command, what)
 

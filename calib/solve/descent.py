@@ -18,7 +18,7 @@ from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
-from calib.solve.estimate import cost_of
+from calib.solve.estimate import rest_of
 from calib.solve.graph import Graph, KeptRows
 from calib.solve.torn import astray
 
@@ -55,8 +55,7 @@ class Pass:
         compute: linearises everything there: that, and the graph that it is in.
         journal: of the fit; None where the pass is not worth keeping.
         asked: what the linearisation depends on beside the state and what was asked before.
-        of_noise: unknowns by which rows are weighed: no cost that is to fall depends on their
-            priors, nor on the rows of scatter that tell of them.
+        of_noise: as of `rest_of`.
     """
 
     def __init__(
@@ -89,10 +88,8 @@ class Pass:
     def _summary(self) -> Answer:
         linear, graph = self.whole
         before = np.nan if linear.cost_before is None else linear.cost_before
-        moved = ((self.values[u.name] - u.mean) / u.sigma for u in self.of_noise)
-        aside = (linear.beams_chi2 + sum(float(each @ each) for each in moved)) / 2
         return {
-            "of_rest": np.float64(cost_of(linear, graph, self.values) - aside),
+            "of_rest": np.float64(rest_of(linear, graph, self.values, self.of_noise)),
             "of_beams": np.float64(linear.beams_cost),
             "before": np.float64(before),
             "T": np.array([each.T for each in linear.weighed]),
@@ -106,7 +103,7 @@ class Pass:
 
     @property
     def cost(self) -> float:
-        """Half the robust chi-square of everything, priors included."""
+        """Half the robust chi-square of all that a fit is to lower: see `rest_of`."""
         return float(self._found["of_rest"]) + self.beams_cost
 
     @property
@@ -184,8 +181,13 @@ class Descent:
         return self.here.whole[1]
 
     def cost(self) -> float:
-        """Half the robust chi-square where all was linearised last, priors included."""
+        """Half the robust chi-square where all was linearised last: see `rest_of`."""
         return self.here.cost
+
+    @property
+    def of_noise(self) -> list[Unknown]:
+        """The unknowns of effects on the noise that have priors of their own."""
+        return [u for u in self.problem.of_noise if u.name not in self.held]
 
     def descend(
         self,
@@ -310,8 +312,7 @@ class Descent:
         worth = beams and bool(self.problem.scans)  # trackers and targets alone cost little
         compute = self.linearising(self.values, beams, **how)
         journal = self.journal if worth else None
-        of_noise = self.problem.of_noise
-        self.here = Pass(self.values, compute, journal, asked=asked, of_noise=of_noise)
+        self.here = Pass(self.values, compute, journal, asked=asked, of_noise=self.of_noise)
 
     def linearising(
         self,

@@ -153,6 +153,24 @@ def cost_of(linear: Linearisation, graph: Graph, values: Mapping[str, np.ndarray
     return linear.chi2 / 2 + graph.error(values, measured=True)
 
 
+def rest_of(
+    linear: Linearisation,
+    graph: Graph,
+    values: Mapping[str, np.ndarray],
+    of_noise: Sequence[Unknown],
+) -> float:
+    """What of that a fit is to lower beside the cost of beams: nothing by which rows are weighed.
+    Where noise is estimated, its priors and the rows of scatter that tell of it have no part.
+
+    Args:
+        linear, graph, values: as of `cost_of`.
+        of_noise: unknowns of effects on the noise that have priors of their own.
+    """
+    moved = ((values[u.name] - u.mean) / u.sigma for u in of_noise)
+    aside = linear.beams_chi2 + sum(float(each @ each) for each in moved)
+    return cost_of(linear, graph, values) - aside / 2
+
+
 def values_of(problem: Problem, state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Where a state puts a problem's unknowns; those that it lacks are where they start."""
     known = problem.variables.items()

@@ -13,7 +13,7 @@ from calib.problem.model import Model
 from calib.problem.problem import Block, Problem
 from calib.solve.added import declared
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
-from calib.solve.estimate import Estimate, Start, cost_of, values_of
+from calib.solve.estimate import Estimate, Start, rest_of, values_of
 from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
 from calib.solve.reweight import reweighted
 from calib.solve.turned import least_turned, lidars_turned, turned_far
@@ -159,7 +159,7 @@ def _raised(loop: Loop, more: float = UPHILL, least: float = 0.0) -> bool:
     linear, graph = loop.linearising(first, beams=False)()
     asked = loop.problem, first, loop.associations, loop.here.weighed
     of_beams = loop.journal.answer(first, lambda: {"cost": np.float64(beams_cost(*asked))})["cost"]
-    return cost > (cost_of(linear, graph, first) + of_beams) * (1 + more) + least
+    return cost > (rest_of(linear, graph, first, loop.of_noise) + of_beams) * (1 + more) + least
 
 
 def _not_raised(loop: Loop, estimate: Estimate) -> Estimate:

@@ -270,9 +270,12 @@ def test_targets_that_are_mixed_up(rec):
     ("times", "unit"), [(1.0, None), (1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanos")]
 )
 def test_times_in_another_unit(times, unit):
-    time_s = times * (1.7e9 + np.cumsum([0.0, 90, 100, 3600, 80, 0, 70]))
-    told = list(odd_times(SimpleNamespace(timed=True, time_s=time_s)))
-    assert len(told) == (unit is not None) and all(f"is it in {unit}" in each for each in told)
+    for start_s, gap_s in ((0.0, 90.0), (1.7e9, 10.0), (1.7e9, 86400.0)):  # a stop a day, too
+        if start_s or times < 2e3:  # from 0 on, others than milliseconds need a longer look
+            time_s = times * (start_s + gap_s * np.array([0.0, 1, 2, 40, 41, 41, 42]))
+            told = list(odd_times(SimpleNamespace(timed=True, time_s=time_s)))
+            assert len(told) == (unit is not None), time_s
+            assert all(f"is it in {unit}" in each for each in told)
     assert list(odd_times(SimpleNamespace(timed=False, time_s=np.full(7, np.nan)))) == []
 
 

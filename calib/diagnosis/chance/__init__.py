@@ -234,14 +234,12 @@ def chances(
     return [chance for chance in found if chance is not None]
 
 
-def of_lidar(
-    some: Sequence[Scatter], blunders: Sequence[Blunder], others: Others, noisier: float = 1.0
-) -> list[Chance]:
+def of_lidar(some: Sequence[Scatter], blunders: Sequence[Blunder], others: Others) -> list[Chance]:
     """The same of effects on where the LiDAR is at each stop, scans that are blunders left out;
-    arguments as of `rows_by_chance` and `chances`."""
+    arguments as of `rows_by_chance`."""
     wild = [blunder.group for blunder in blunders if blunder.found]
     rows = of_poses(others, wild) if some else None
-    found = [_of_values(effect, rows.of_noisier(noisier)) for effect in some if rows is not None]
+    found = [_of_values(effect, rows) for effect in some if rows is not None]
     return [chance for chance in found if chance is not None]
 
 

@@ -43,17 +43,19 @@ class BeamScatter:
     @property
     def sentence(self) -> str:
         """What it says, and what to do about it."""
-        beside = f"{100 * self.common:.0f} % of it is common to beams beside each other"
+        beside = (
+            f"{100 * self.common:.0f} % of the variance is common to beams beside each other, or "
+            "to the same beam at other stops"
+        )
         if self.alone <= TOLERATED:
             return (
                 f"The ranges scatter {self.times:.1f} times as widely as the LiDAR's noise model "
-                f"says, and {beside}, or to the same beam at other stops: that is no noise of "
-                "single beams."
+                f"says, and {beside}: that is no noise of single beams."
             )
         return (
             f"The ranges scatter {self.alone:.1f} times as widely as the LiDAR's noise model says, "
-            f"each beam by itself ({beside}). No effect explains that, and sigmas are widened by "
-            "it; a larger sigma_range_m of the lidar in rig.yaml would say so."
+            f"each beam by itself ({beside}). Sigmas are widened by that; a larger sigma_range_m "
+            "of the lidar in rig.yaml would say so."
         )
 
     @classmethod
@@ -61,12 +63,15 @@ class BeamScatter:
         """Of the beams that have weight, at an estimate with scans."""
         stops = list(over_stops(_Residuals(estimate.values), estimate.scans, estimate.associations))
         z, ring, column = (np.concatenate(each) for each in zip(*stops, strict=True))
-        stop = np.repeat(np.arange(len(stops)), [len(each[0]) for each in stops])
+        each = [len(some[0]) for some in stops]
+        stop = np.repeat(np.arange(len(stops)), each)
+        rigs = [scan.stops.rig.name for scan in estimate.scans]
+        lidar = np.repeat(np.unique(rigs, return_inverse=True)[1], each)
         square = float(np.mean(np.square(z)))
         alike = (
             _beside(z, (stop, ring), column),
             _beside(z, (stop, column), ring),
-            _again(z, (ring, column)),
+            _again(z, (lidar, ring, column)),
         )
         return cls(float(np.sqrt(square)), float(np.clip(max(alike) / square, 0.0, 1.0)))
 

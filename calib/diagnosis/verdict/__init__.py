@@ -177,7 +177,7 @@ def conclude(
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
     untestable, unsure = _untestable(first), unconfirmed(doubt, over) if doubt else ""
-    last = [*lasting(found.blunders, first.stand.sources)]
+    last = [*lasting(found.blunders, first.checked, first.stand.sources)]
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)

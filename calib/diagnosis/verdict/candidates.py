@@ -22,6 +22,7 @@ from calib.results.solution import one_unit
 # Of what an effect explains, from which on others do the same. Of a tracker's scale, those of LiDAR
 # and scanner explain 0.9999 together, the next pair 0.93 (30 stops of a rig of the whole chain).
 THE_SAME = 0.99
+LOST_BY_CHANCE = 6.6  # squared sigmas that one parameter explains by chance once in a hundred times
 ALIKE = (
     "no stops (at every pose of the arm both move all that is seen alike), but a measurement of "
     "one of them itself"
@@ -149,7 +150,10 @@ def _rivals(step: NamedEffect) -> list[dict[str, Any]]:
 def _pairs(step: NamedEffect) -> list[dict[str, Any]]:
     """Two effects that together do to all that is measured what one of one parameter does, though
     neither of them does alone: as the scales of three instruments, of which only ratios show."""
-    screen, (column, *more) = step.before.named, step.candidate.test.columns
+    screen, columns = step.before.named, step.candidate.test.columns
+    if len(columns) > 1 or step.effect.shape_name:  # its finest shape is known by itself alone
+        return []
+    column, lost = columns[0], LOST_BY_CHANCE * screen.common / step.candidate.test.statistic
     alone = {step.effect.family, *(rival.effect.family for rival in step.rivals)}
     single = [c for c in screen.candidates if len(c.test.columns) == 1]
     information, size = screen.scores.information, float(step.candidate.test.estimate()[0])
@@ -158,7 +162,7 @@ def _pairs(step: NamedEffect) -> list[dict[str, Any]]:
         both = np.concatenate([c.test.columns for c in pair])
         each = np.linalg.lstsq(information[np.ix_(both, both)], information[both, column])[0]
         share = each @ information[both, column] / information[column, column]
-        if not more and share >= THE_SAME:
+        if 1.0 - share <= min(lost, 1.0 - THE_SAME):
             names = [c.effect.family for c in pair]
             out.append({"effects": names, "estimate": (size * each).tolist()})
     return out

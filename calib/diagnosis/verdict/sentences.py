@@ -216,7 +216,7 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
         out.append(f"Nothing that was measured tells it from {step.effect.twin}.")
     out += [
         f"Nothing that was measured tells it from {all_of(pair['effects'])} together."
-        for pair in candidate["together"]
+        for pair in candidate["together"][:MOST_LISTED]
     ]
     return [*out, *map(rival_sentence, candidate["rivals"][:MOST_LISTED])]
 
