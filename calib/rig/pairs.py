@@ -44,13 +44,11 @@ class SeenPair:
     poses: tuple[Array, ...]
     d_twist: Array
 
-    def seen(self, order: Sequence[int] = range(4), of: Sequence[str] = ()) -> Array:
-        """(K, 4, 4) as measured, the columns of the quaternions of some bodies taken in an
-        order."""
+    def seen(self, other: Array | None = None, of: Sequence[str] = ()) -> Array:
+        """(K, 4, 4) as measured; of some bodies quaternions are `other` (4, 4) times what is
+        written."""
         T = [
-            se3.from_xyz_quat(
-                pose[:, :3], pose[:, 3:][:, list(order)] if name in of else pose[:, 3:]
-            )
+            se3.from_xyz_quat(pose[:, :3], pose[:, 3:] @ other.T if name in of else pose[:, 3:])
             for name, pose in zip(self.names, self.poses, strict=True)
         ]
         return T[0] if len(T) == 1 else se3.inverse(T[0]) @ T[1]

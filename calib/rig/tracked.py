@@ -45,7 +45,13 @@ FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
-QUATERNION_ORDERS = {"qx, qy, qz, qw": (3, 0, 1, 2), "qz, qw, qx, qy": (1, 2, 3, 0)}
+# What quaternions are in place of qw, qx, qy, qz, and what makes these of it.
+OTHER_QUATERNIONS = {
+    "qx, qy, qz, qw": np.eye(4)[[3, 0, 1, 2]],
+    "qz, qw, qx, qy": np.eye(4)[[1, 2, 3, 0]],
+    "qw, -qx, -qy, -qz (the inverse turn)": np.diag([1.0, -1.0, -1.0, -1.0]),
+}
+HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far more than CAD errs by
 
 
 _Met = list[tuple[SeenPair, Array, bool]]  # pairs at a stop, how far off, whether if exchanged
@@ -131,18 +137,18 @@ def _at_all_stops(pair: SeenPair) -> Suspect | None:
     if turns(pair, seen)[0] < TURNED_RAD:
         return None
     ways = {  # columns of all bodies, or of one of them
-        (order, of): turns(pair, pair.seen(index, of))
-        for order, index in QUATERNION_ORDERS.items()
+        (what, of): turns(pair, pair.seen(other, of))
+        for what, other in OTHER_QUATERNIONS.items()
         for of in dict.fromkeys([pair.names, *((name,) for name in pair.names)])
     }
-    fitting = [way for way, (left, _) in ways.items() if left < FITS_RAD]
+    fitting = [w for w, (left, hangs) in ways.items() if left < FITS_RAD and hangs < HANGS_RAD]
     if not fitting:
         return None
-    order, of = min(fitting, key=lambda way: ways[way][1])
+    what, of = min(fitting, key=lambda way: ways[way][1])
     names = " and ".join(of)
     said = (
         f"{names} {'turns' if len(of) == 1 else 'turn'} as the joints say if the columns qw, qx, "
-        f"qy, qz hold {order}; put them in their order"
+        f"qy, qz hold {what}; write them as they are named"
     )
     return Suspect("body", names, said)
 

@@ -98,17 +98,25 @@ def test_placeholders(sound):
     assert found.stops == (names[b],) and "to the last digit" in found.sentence
 
 
-@pytest.mark.parametrize("order", [(1, 2, 3, 0), (3, 0, 1, 2)])
-def test_quaternions_in_another_order(sound, shared, order):
+@pytest.mark.parametrize(
+    ("order", "sign", "named"),
+    [
+        ((1, 2, 3, 0), 1, "hold qx, qy, qz, qw"),
+        ((3, 0, 1, 2), 1, "hold qz, qw, qx, qy"),
+        ((0, 1, 2, 3), -1, "hold qw, -qx, -qy, -qz (the inverse turn)"),
+    ],
+)
+def test_quaternions_written_otherwise(sound, shared, order, sign, named):
+    def otherwise(poses):
+        q = poses[:, 3 + np.array(order)]
+        return np.hstack([poses[:, :3], q * ([1, sign, sign, sign] if sign < 0 else 1)])
+
     def turned(recording, bodies):
         for body in bodies:
-            recording = changed(
-                recording, body, slice(None), lambda p: p[:, [0, 1, 2, *(3 + np.array(order))]]
-            )
+            recording = changed(recording, body, slice(None), otherwise)
         return recording
 
     rig, recording = sound
-    named = {(1, 2, 3, 0): "hold qx, qy, qz, qw", (3, 0, 1, 2): "hold qz, qw, qx, qy"}[order]
     found = only(odd_bodies(rig, turned(recording, (BASE, MOUNT))))
     assert named in found.sentence and found.stops == ()
     assert found.name == f"{BASE} and {MOUNT}"
