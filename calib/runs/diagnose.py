@@ -22,6 +22,7 @@ from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, weighed
 from calib.diagnosis.verdict.names import believed
+from calib.diagnosis.verdict.sentences import BAD
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
 from calib.effects import own_effects
@@ -263,7 +264,7 @@ def _command(run: Run, found: Diagnosis) -> str:
     if tokens := told.tokens(found.blunders):
         return command_without(run, tokens)
     names = [*found.worth_adding, *found.formulas]
-    if found.blunders or not names:
+    if found.verdict == BAD or not names:
         return ""
     out = f"{run.folder}-{'formula' if found.formulas else 'added'}"
     return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", out])

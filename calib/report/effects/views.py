@@ -54,7 +54,7 @@ class Walk:
 def walk_of(effect: Effect, rig: Rig) -> Walk | None:
     """The rows over which an effect is drawn; None where it depends on what no room has."""
     over = [name for name in effect.covariates if name != "time_s"]
-    if set(over) & LOADS:  # of an arm that stands still
+    if "joints" in over and set(over) & {*LOADS, "temperature_c"}:  # of an arm that stands still
         over.remove("joints")
     if effect.by_chance or set(over) & {"ring", "label", "stop", "location", "surface", "target"}:
         return _things(effect, rig)
