@@ -30,6 +30,7 @@ from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.scan import ScanStop
 from calib.results.intervals import Intervals, intervals
+from calib.results.sigmas import TOLERATED
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
@@ -131,8 +132,9 @@ class Stand:
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
         values = chances(scores, chance, at)
-        if any(c.found for c in values):  # of beams that are noisier, means scatter more as well
-            values = chances(scores, chance, at, max(1.0, self.beams.alone))
+        # Where beams are noisier than stated, the mean of those of a stop scatters more as well.
+        if any(c.found for c in values) and self.beams.alone > TOLERATED:
+            values = chances(scores, chance, at, self.beams.alone)
         return Look(
             stand=self,
             linear=linear,

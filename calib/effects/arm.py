@@ -168,10 +168,11 @@ def _own(rig: Rig) -> Own:
 
 
 class ArmRailBending(Effect):
-    """The rail of a sliding joint is bent: an arc in either plane along it, and a steady twist.
+    """The rail of a sliding joint is bent or twisted.
 
-    Beams of gantries sag under what slides on them, and rails follow what they are screwed to.
-    Where the joint has gone by q, the arc turns what slides by k q and shifts it by k q^2 / 2.
+    It is an arc in either plane along it, and turns steadily about itself. Beams of gantries sag
+    under what slides on them, and rails follow what they are screwed to. Where the joint has gone
+    by q, the arc turns what slides by k q and shifts it by k q^2 / 2.
     """
 
     name = "arm_rail_bending"
@@ -320,7 +321,7 @@ class ArmJointLag(ArmBacklash):
 
 
 class ArmJointThermal(ArmJointOffset):
-    """A joint's zero goes with the temperature, as gear and housing grow unlike each other."""
+    """A joint's zero goes with the temperature. Gear and housing grow unlike each other."""
 
     name = "arm_joint_thermal"
     unit = "rad/K"

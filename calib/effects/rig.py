@@ -100,10 +100,10 @@ class MountSettle(Settles, MountSlip):
 
 
 class LidarSlip(MountSlip):
-    """The LiDAR slips once on its mount, and stays where it slipped to; or its azimuth is counted
-    from elsewhere.
+    """The LiDAR slips once on its mount.
 
-    Tracked bodies on the mount stay where they are. Where there are none it is `MountSlip`.
+    It stays where it slipped to; or its azimuth is counted from elsewhere from then on. Tracked
+    bodies on the mount stay where they are. Where there are none it is `MountSlip`.
     """
 
     name = "lidar_slip"

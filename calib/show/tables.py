@@ -151,6 +151,7 @@ def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
             print_command(console, f"rigcal effects {name} -o {name}.svg", "A picture of it:")
         return
     table = columns_table("effect", "what")
+    table.columns[0].min_width = max(len(page["name"]) for page in pages)
     table.columns[1].no_wrap, table.columns[1].overflow = True, "ellipsis"
     for page in pages:
         table.add_row(page["name"], re.split("[:;.]( |$)", page["what"])[0])

@@ -186,7 +186,8 @@ def test_people_read_it_in_mm_and_within_100_columns(studies, capsys):
     run, found = studies["hidden"]
     print_diagnosis(found, run.summary["residual"])
     out = capsys.readouterr().out
-    commands = [remedy["plan"] for remedy in found.remedies]  # in one line, ready to be pasted
+    # In one line, ready to be pasted.
+    commands = [found.command, *(remedy["plan"] for remedy in found.remedies)]
     assert max(len(line) for line in out.splitlines() if line not in commands) <= 100
     row = next(line for line in out.splitlines() if line.startswith("1 "))
     estimate_m, sigma_m = (found.candidates[0]["parameters"][k][0] for k in ("estimate", "sigma"))
