@@ -212,6 +212,14 @@ class CsvTable:
             raise InputError(f"{self.path}: row {row + 1} ({self._names[row]}): {problem}")
 
 
+def in_time(stops: Sequence[str], time_s: Array) -> list[str]:
+    """Names of stops in the order in which they were made; in that of their rows where one has no
+    time (K,)."""
+    if not np.isfinite(time_s).all():
+        return list(stops)
+    return [stops[k] for k in np.argsort(time_s, kind="stable")]
+
+
 def level_columns(frame: str) -> list[str]:
     """Of what an accelerometer in a frame feels."""
     return [f"{frame}.{axis}" for axis in _FELT]

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import Creeps, Settles, Slips, finite
-from calib.effects.range import AMBIENT_C
+from calib.effects.basis import Creeps, Settles, Slips, warmer_k
 from calib.rig import Rig
 from chains.frames import Edge
 from chains.minimal import Own, across, own_errors
@@ -213,8 +212,7 @@ class ArmRailBending(Effect):
 def _rails(rig: Rig) -> list[Edge]:
     """The edges of sliding joints that are read."""
     sliding = (e for e in rig.tree.edges if e.joint is not None and e.joint.kind == "prismatic")
-    unread = rig.passive
-    return [e for e in sliding if e.joint.leads and e.joint.name not in unread]
+    return [e for e in sliding if e.joint.leads and e.joint.name not in rig.passive]
 
 
 class ArmJointScale(Effect):
@@ -336,8 +334,7 @@ class ArmJointThermal(ArmJointOffset):
         return tuple(replace(p, unit=f"{p.unit}/K") for p in super().params(rig))
 
     def basis(self, view: View) -> np.ndarray:
-        warmer = finite(view["temperature_c"] - AMBIENT_C)
-        return warmer[:, None, None] * super().basis(view)
+        return warmer_k(view)[:, None, None] * super().basis(view)
 
 
 class ArmThermalGrowth(Effect):
@@ -356,7 +353,7 @@ class ArmThermalGrowth(Effect):
         return (Param("alpha", "1/K", 5e-5),) if rig.arm_edges else ()
 
     def basis(self, view: View) -> np.ndarray:
-        tree, warmer = view.rig.tree, finite(view["temperature_c"] - AMBIENT_C)
+        tree, warmer = view.rig.tree, warmer_k(view)
         basis = np.zeros((len(warmer), len(tree.edges), 6, 1))
         for name in view.rig.arm_edges:
             e = tree.edge_names.index(name)

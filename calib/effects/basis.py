@@ -11,6 +11,7 @@ from calib.rig import Rig
 from sensors.lidar import GRAZING_RAD
 
 RANGE, AZIMUTH, ELEVATION = range(3)
+AMBIENT_C = 20.0  # where the error is zero by definition: the usual reference (ISO 1)
 
 
 def beam(axis: int, *columns: np.ndarray) -> np.ndarray:
@@ -38,6 +39,11 @@ TIMES_BESIDE = 8
 def finite(column: np.ndarray) -> np.ndarray:
     """A column with 0 where nothing was recorded."""
     return np.where(np.isfinite(column), column, 0.0)
+
+
+def warmer_k(view: View) -> np.ndarray:
+    """By how much it is warmer than where errors by temperature are zero (rows,), K."""
+    return finite(view["temperature_c"] - AMBIENT_C)
 
 
 def place_of(values: np.ndarray, known: np.ndarray) -> np.ndarray:

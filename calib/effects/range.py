@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, OneHot, Param, Site, View
-from calib.effects.basis import RANGE, beam, finite, incidence_rad, place_of, range_m, settled
+from calib.effects.basis import RANGE, beam, incidence_rad, place_of, range_m, settled, warmer_k
 from calib.rig import Rig
 
 STUDY = "Pushing the Limits of LiDAR: Accurate Performance Analysis of Indoor 3D LiDARs"
 FAINTEST = 0.01  # of the median intensity: about 1 count of 8 bits, where a room's median is 100
-AMBIENT_C = 20.0  # where the error is zero by definition: the usual reference (ISO 1)
 
 
 class RangeEffect(Effect):
@@ -233,7 +232,7 @@ class TemperatureDrift(RangeEffect):
     source = "Glennie and Lichti 2011, Remote Sensing 3(3):539: stability of an HDL-64E"
 
     def column(self, view: View) -> np.ndarray:
-        return finite(view["temperature_c"] - AMBIENT_C)
+        return warmer_k(view)
 
 
 class AzimuthRangeHarmonic(Effect):

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from sensors.stops import in_time
+
 
 @dataclass(frozen=True)
 class Suspect:
@@ -86,8 +88,7 @@ def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> 
         return []
     from scipy.stats import hypergeom
 
-    order = np.argsort(time_s, kind="stable") if np.isfinite(time_s).all() else range(len(stops))
-    names, out = [stops[k] for k in order], []
+    names, out = in_time(stops, time_s), []
     bad = np.isin(names, [*wrong])
     while bad.sum() > 2:
         n, edges = len(names), np.diff(bad.astype(int), prepend=0, append=0)

@@ -123,7 +123,7 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 
 
 def _at_all_stops(pair: SeenPair) -> Suspect | None:
-    """Bodies exchanged, or quaternions in another order."""
+    """Bodies exchanged, or quaternions written otherwise."""
     if len(pair.stops) < 4:
         return None
     seen, names = pair.seen(), " and ".join(pair.names)

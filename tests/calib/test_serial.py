@@ -27,8 +27,8 @@ def told(errors, time_s=None, effect="tracker_scatter", turn=None):
     """The p-value for errors (K, r) of a body at the stops of a table, with the times of these; and
     what turns (K, r, r) the rows' own axes to theirs."""
     stops = STOPS[: len(errors)]
-    timed = np.full(len(stops), time_s is not None)
-    recording = SimpleNamespace(stops=stops, timed=timed, time_s=time_s)
+    time_s = np.full(len(stops), np.nan) if time_s is None else time_s  # as of no times
+    recording = SimpleNamespace(stops=stops, time_s=time_s)
     problem = SimpleNamespace(sources=[SimpleNamespace(recording=recording)])
     others = SimpleNamespace(problem=problem)
     known = 2.0 * np.eye(errors.shape[1])
@@ -108,7 +108,6 @@ def test_values_of_stops_are_taken_as_the_stops_were_made():
                 recording=SimpleNamespace(
                     folder=Path(day),
                     stops=[STOPS[k] for k in order],
-                    timed=np.ones(30, bool),
                     time_s=60.0 * order,
                 )
             )
@@ -136,7 +135,7 @@ def test_turns_do_not_hide_shifts_in_another_unit():
         shift_m = np.outer(1e-3 * (k - 14.5) / 15, [1.0, 0.5, -0.5])
         shift_m = shift_m if steady else rng.permutation(shift_m)
         values = np.hstack([5e-3 * rng.normal(size=(30, 3)), shift_m])
-        recording = SimpleNamespace(stops=STOPS[:30], timed=np.zeros(30, bool))
+        recording = SimpleNamespace(stops=STOPS[:30], time_s=np.full(30, np.nan))
         effect = find("stop_pose_scatter").among(STOPS[:30])
         sd = np.tile(np.repeat([5e-3, 6e-4], 3), 30)
         others = SimpleNamespace(

@@ -1,14 +1,15 @@
 """Whether beams scatter each by itself: what those beside each other have in common.
 
 Where a LiDAR is noisier than its noise model says, each beam errs by itself. Where something is
-missing from the model, beams beside each other in a ring err alike, and what belongs to a direction
-of the LiDAR comes again at every stop.
+missing from the model, beams beside each other err alike, in a ring or from ring to ring, and what
+belongs to a direction of the LiDAR comes again at every stop.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class BeamScatter:
         some of them, drawn evenly, stand for all."""
         some = drawn_evenly(len(estimate.scans), STOPS_ASKED, seed=0)
         scans, met = ([of[i] for i in some] for of in (estimate.scans, estimate.associations))
-        stops = list(over_stops(_Residuals(estimate.values), scans, met))
+        stops = list(over_stops(partial(_residuals, estimate.values), scans, met))
         z, ring, column = (np.concatenate(each) for each in zip(*stops, strict=True))
         each = [len(of_stop[0]) for of_stop in stops]
         stop = np.repeat(np.arange(len(stops)), each)
@@ -100,17 +101,12 @@ def _again(z: np.ndarray, same: Sequence[np.ndarray]) -> float:
     return float(np.sum(np.square(total) - squares)) / pairs if pairs else 0.0
 
 
-@dataclass(frozen=True)
-class _Residuals:
-    """Gives a stop's residuals in sigmas, with the ring and the column of each; can be sent."""
-
-    values: Values
-
-    def __call__(
-        self, scan: ScanStop, association: Association
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rows = scan.rows(self.values, association)
-        ring, azimuth_rad = (np.asarray(rows.view[name]) for name in ("ring", "azimuth_rad"))
-        kept = rows.weight > 0
-        z = (rows.residual_m / rows.sigma_m)[kept]
-        return z, ring[kept], np.round(azimuth_rad[kept] / COLUMN_RAD).astype(int)
+def _residuals(
+    values: Values, scan: ScanStop, association: Association
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A stop's residuals in sigmas, with the ring and the column of each."""
+    rows = scan.rows(values, association)
+    ring, azimuth_rad = (np.asarray(rows.view[name]) for name in ("ring", "azimuth_rad"))
+    kept = rows.weight > 0
+    z = (rows.residual_m / rows.sigma_m)[kept]
+    return z, ring[kept], np.round(azimuth_rad[kept] / COLUMN_RAD).astype(int)

@@ -19,7 +19,8 @@ from scipy import special
 from calib.blunders.judged import Blunder
 from calib.blunders.others import Others
 from calib.effects import Scatter, Site
-from calib.problem.model import Source, labels
+from calib.problem.model import labels
+from sensors.stops import in_time
 
 FEWEST_IN_SERIES = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
 OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
@@ -35,7 +36,11 @@ def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
     """
     sources = others.problem.sources
     named = zip(sources, labels(sources), strict=True)
-    turn = {(of, stop): at for each, of in named for at, stop in enumerate(_in_time(each))}
+    turn = {
+        (of, stop): at
+        for source, of in named
+        for at, stop in enumerate(in_time(source.recording.stops, source.recording.time_s))
+    }
     series: Iterator[np.ndarray] = iter(())
     if effect.widens:
         series = _of_rows(OF_ROWS.get(effect.site, ""), blunders, turn)
@@ -43,15 +48,6 @@ def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
         series = _of_values(effect, others, turn)
     p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_SERIES]
     return min(1.0, len(p) * min(p)) if p else 1.0
-
-
-def _in_time(source: Source) -> list[str]:
-    """The stops of a recording as they were made; as its table has them where it has no times."""
-    recording = source.recording
-    order = np.arange(len(recording.stops))
-    if np.all(recording.timed):
-        order = np.argsort(recording.time_s, kind="stable")
-    return [recording.stops[k] for k in order]
 
 
 def _of_rows(

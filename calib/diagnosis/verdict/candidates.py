@@ -20,7 +20,7 @@ from calib.results.holdout import Fall, fall_document
 from calib.results.solution import one_unit
 
 # Of what an effect explains, from which on others do the same. Of a tracker's scale, those of LiDAR
-# and scanner explain 0.9999 together, the next pair 0.93 (30 stops of a rig of the whole chain).
+# and scanner explain 0.9999 together, the next pair 0.92 (30 stops of a rig of the whole chain).
 THE_SAME = 0.99
 LOST_BY_CHANCE = 6.6  # squared sigmas that one parameter explains by chance once in a hundred times
 ALIKE = (
