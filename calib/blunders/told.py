@@ -10,6 +10,7 @@ import numpy as np
 from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import TELLING, Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
+from calib.effects.rig import DOF
 from calib.problem.model import Source, labels, same_mesh
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
@@ -137,15 +138,17 @@ def of_link(
     Args:
         first, later: what the recordings are called.
         name: of the link.
-        way: its parameter that shows it best; by how much that changed, with its sigma and unit.
+        way: its parameter that shows it best, or that all changed alike; by how much that changed,
+            with its sigma and unit.
         p: of so large a change by chance.
         instead: links of which one may have moved in its place.
     """
     parameter, change, sigma, unit = way
     by = f"{parameter} by {'-' if change < 0 else ''}{size_told(abs(change), sigma, unit)}"
     other = f" (or, in its place, {' or '.join(instead)})" if instead else ""
+    what = "moved" if parameter in DOF else "changed"
     said = (
-        f"between {first} and {later} {name} moved, {by}{other}, and one fit takes it for the "
+        f"between {first} and {later} {name} {what}, {by}{other}, and one fit takes it for the "
         "same; fit each alone, the later with the run of the first as its --prior"
     )
     return {

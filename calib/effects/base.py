@@ -133,6 +133,8 @@ class Effect(ABC):
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
         needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
+        of_members: True where its parameters are one quantity of several rings or labels, whose
+            mean is a quantity as well.
         of_volume: True where it is the tracker's error at a place, which markers of targets have as
             well.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.
@@ -157,6 +159,7 @@ class Effect(ABC):
     jumps: ClassVar[bool] = False
     joint_kind: ClassVar[str] = ""
     needs_lidar: ClassVar[bool] = False
+    of_members: ClassVar[bool] = False
     of_volume: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False
     widens: ClassVar[bool] = False

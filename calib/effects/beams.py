@@ -20,6 +20,7 @@ class RingElevationOffset(Effect):
     formula = "elevation = true + d_ring"
     typical = "0.2 to 2 mrad"
     covariates = ("ring",)
+    of_members = True
     confounded_with = ("ring_range_offset", "incidence_angle_bias", "beam_origin_offset")
     source = "Glennie and Lichti 2010, Remote Sensing 2(6):1610; Ouster OS1 data sheet: 0.01 deg"
     axis = ELEVATION

@@ -69,6 +69,7 @@ class RingRangeOffset(Effect):
     formula = "range = true + a_ring"
     typical = "1 to 25 mm, patterned over the rings"
     covariates = ("ring",)
+    of_members = True
     confounded_with = ("range_offset", "ring_elevation_offset", "near_range_bias")
     source = f"{STUDY}, Fig. 9; Velodyne HDL-64E factory tables"
 
@@ -188,6 +189,7 @@ class LabelRangeOffset(Effect):
     formula = "range = true + m_label"
     typical = "0 to 10 mm; none found on stone"
     covariates = ("label",)
+    of_members = True
     confounded_with = ("intensity_range_walk", "moved_surface", "range_offset")
     source = "Lenda 2015, PFG: plexiglas and polystyrene; Lichti and Harvey: none on stone"
 

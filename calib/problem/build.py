@@ -92,6 +92,7 @@ def effect_unknown(term: Term, source: Source) -> Unknown:
         units=(p.unit for p in params),
         role=Role.SCATTER if term.effect.by_chance else Role.CALIBRATION,
         owner=Owner(effect=name, rig=term.rig),
+        of_members=term.effect.of_members,
     )
 
 

@@ -82,6 +82,7 @@ class Unknown:
         units: (dim,) "m" or "rad" or another unit, per tangent direction.
         role: what it stands for.
         owner: whose it is.
+        of_members: whether its numbers are one quantity of several members, whose mean is one too.
         weight: robust weight of what was known before, 0 to 1.
         scatter: of joint readings, joint -> how widely it scatters beyond what its sigma was at
             first.
@@ -95,6 +96,7 @@ class Unknown:
     units: tuple[str, ...]
     role: Role = Role.CALIBRATION
     owner: Owner = OF_ALL
+    of_members: bool = False
     weight: float = 1.0
     scatter: Mapping[str, float] = field(default_factory=dict)
 
@@ -184,6 +186,7 @@ def vector_unknown(
     mean: np.ndarray | float = 0.0,
     role: Role = Role.CALIBRATION,
     owner: Owner = OF_ALL,
+    of_members: bool = False,
     weight: float = 1.0,
 ) -> Unknown:
     """Numbers (n,) known to `sigma` (n,) about `mean`."""
@@ -196,5 +199,6 @@ def vector_unknown(
         units=tuple(units),
         role=role,
         owner=owner,
+        of_members=of_members,
         weight=weight,
     )

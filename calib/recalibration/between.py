@@ -49,9 +49,11 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
 
 
 def _told(first: str, later: str, link: Link, rig: str) -> dict[str, Any]:
-    """As a blunder, by the parameter that shows it best."""
+    """As a blunder, by the parameter, or the mean of them, that shows it best."""
     best = int(np.argmax(np.abs(link.change) / link.sigma))
     way = link.parameters[best], link.change[best], link.sigma[best], link.units[best]
+    if link.as_one:
+        way = "all alike", *link.of_mean, link.units[0]
     instead = [f"{rig}{name}" for name in link.instead]
     return told.of_link(first, later, f"{rig}{link.name}", way, p=link.p_value, instead=instead)
 

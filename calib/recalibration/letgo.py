@@ -179,6 +179,7 @@ def _link(
         covariance = G @ covariance @ G.T + D - G[:, k] @ D
     else:
         change, covariance = change[k], covariance[k, k]
+    of_mean = float(change.mean()), float(np.sqrt(covariance.mean()))
     return Link(
         name=variable.name,
         moved=freed > 0.0,
@@ -187,4 +188,5 @@ def _link(
         sigma=np.sqrt(np.diag(covariance)),
         parameters=variable.dofs,
         units=variable.units,
+        of_mean=of_mean if variable.of_members else (),
     )

@@ -99,6 +99,10 @@ def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
         scale, told = shown(unit)
         if not len(mine):
             continue
+        if mean := link.get("of_mean"):
+            by, sigma_by = (scale * each for each in mean)
+            yield f"{words.changed} {by:+.2f} ± {sigma_by:.2f} {told} (all alike)"
+            continue
         if not of_frame and len(mine) > 1:
             every = change[np.array(link["units"]) == unit]
             yield f"{words.changed} {scale * np.sqrt(np.mean(every**2)):.2f} {told} rms"

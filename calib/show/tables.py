@@ -330,7 +330,9 @@ def _change(link: Mapping[str, Any]) -> str:
             f"{link['parameters'][i]} {estimate_cell(link['change'][i], link['sigma'][i], unit)}"
             for i in mine
         ]
-        if len(mine) > LISTED_PARAMETERS:
+        if link.get("of_mean"):
+            cells = [f"{len(mine)} values alike, by {estimate_cell(*link['of_mean'], unit)}"]
+        elif len(mine) > LISTED_PARAMETERS:
             rms = np.sqrt(np.mean(np.square([link["change"][i] for i in mine])))
             cells = [f"{len(mine)} values by {shown(unit)[0] * rms:.2f} rms"]
         texts.append(f"{', '.join(cells)} {shown(unit)[1]}".rstrip())

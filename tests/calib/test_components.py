@@ -90,6 +90,37 @@ def test_a_balanced_design_has_the_closed_form():
     assert told.spread(np.array([0.1]))[0] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("known", [1.0, 1e2, 1e3])
+@pytest.mark.parametrize("times", [3, 30, 300])
+def test_a_spread_is_found_however_far_from_the_start(known, times):
+    """Each seen as well, `known` times better than the start is wide, but for the mean of each
+    group, where rounding leaves less than nothing: a closed form."""
+    start, rng = 3e-4, np.random.default_rng(times)
+    sigma = start / known
+    seen = times * start * rng.standard_normal((3, 8)) + sigma * rng.standard_normal((3, 8))
+    about = np.kron(np.eye(3), np.eye(8) - 1 / 8)
+    information = (about - 1e-15 * np.kron(np.eye(3), np.ones((8, 8)))) / sigma**2
+    told = Told(about @ seen.ravel() / sigma**2, information, np.repeat(range(3), 8))
+    expected = np.sqrt(seen.var(axis=1, ddof=1) - sigma**2)
+    np.testing.assert_allclose(told.spread(np.full(3, start)), expected, rtol=1e-3)
+
+
+def test_what_members_have_in_common_is_no_spread():
+    """A weak prior on a range zero pulls at the mean of few members, and would widen them."""
+    rng = np.random.default_rng(8)
+    own, mean = 3e-3 * rng.standard_normal(4), 25e-3
+    sigma, of_zero = 3e-5, 4.4e-3
+    V = sigma**2 * np.eye(4) + of_zero**2  # the range zero, known beforehand, and taken out
+    information = np.linalg.inv(V)
+    told = Told(information @ (own + mean), information, np.zeros(4, int))
+    expected = np.sqrt(own.var(ddof=1) - sigma**2)
+    about = told.about_mean()
+    assert about.spread(np.full(1, 3e-4))[0] == pytest.approx(expected, rel=1e-4)
+    again = Told(information @ (own - mean), information, told.group).about_mean()
+    np.testing.assert_allclose(again.score, about.score, atol=1e-6 * np.abs(about.score).max())
+    assert told.spread(np.full(1, 3e-4))[0] > 2 * expected
+
+
 def test_values_as_fitted_say_the_same_whatever_held_them():
     told = Mixed(5).told()
     for sd in (0.2, 3.0):

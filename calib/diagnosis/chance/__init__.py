@@ -229,7 +229,8 @@ def chances(
     for effect in some:
         at = columns[effect.name]
         score, information = scores.score[at], scores.information[np.ix_(at, at)]
-        rows = Told(score, information, np.zeros(len(at), int)).of_noisier(noisier)
+        rows = Told(score, information, np.zeros(len(at), int))
+        rows = rows.about_mean().of_noisier(noisier)
         found.append(_of_values(effect, rows))
     return [chance for chance in found if chance is not None]
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.effects import CATALOGUE
 from calib.effects.rig import DOF
 from calib.problem.unknowns import Key, Unknown, pose_unknown, vector_unknown
 from calib.residuals.robust import huber_weight
@@ -114,6 +115,8 @@ def unknowns_of(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
     norms = np.array([np.linalg.norm(table["whitened"][at]) for at in vectors.values()])
     weights = huber_weight(norms, np.array([len(at) for at in vectors.values()]))
     weight = dict(zip(vectors, weights.tolist(), strict=True))
+    rigs = ["", *(f"{rig}/" for rig in run.solution.recordings)]
+    of_members = {f"{rig}{e.name}" for rig in rigs for e in CATALOGUE if e.of_members}
     for name, own in owners.items():
         if name in vectors:
             at = vectors[name]
@@ -122,6 +125,7 @@ def unknowns_of(run: Run) -> Iterator[tuple[Unknown, np.ndarray]]:
                 table["sigma"][at],
                 dofs=table["parameter"][at].tolist(),
                 units=table["unit"][at].tolist(),
+                of_members=name in of_members,
                 weight=weight[name],
             )
             yield unknown, table["residual"][at]

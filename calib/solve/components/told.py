@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -44,6 +45,17 @@ class Told:
         score = (scaled @ (values / root)) / root
         return cls(score, (information + information.T) / 2, group)
 
+    def about_mean(self, which: slice = slice(None)) -> Told:
+        """The same of how far some values are from their mean, of which nothing is known: that
+        belongs to what they have in common, as a range zero, however little its prior allows."""
+        of_mean = self.information[:, which].sum(axis=1)
+        seen = float(of_mean[which].sum())
+        if seen <= DIRECTION_SEEN * float(np.trace(self.information)):
+            return self
+        score = self.score - of_mean * (self.score[which].sum() / seen)
+        information = self.information - np.outer(of_mean, of_mean) / seen
+        return replace(self, score=score, information=information)
+
     def of_noisier(self, times: float) -> Told:
         """The same of rows that scatter so many times as widely as their sigmas say."""
         return replace(self, score=self.score / times**2, information=self.information / times**2)
@@ -65,7 +77,16 @@ class Told:
         known = np.diagonal(covariance, axis1=-2, axis2=-1)
         seen = 1.0 - (known + np.square(values)) / variance[self.group]
         slope = np.bincount(self.group, _summed(seen), minlength=len(variance))
-        return log_det - float(np.vdot(self.score, values)), slope
+        of_values = float(np.vdot(self._by_themselves, values / variance[self.group]))
+        return log_det + of_values, slope
+
+    @cached_property
+    def _by_themselves(self) -> np.ndarray:
+        """The values (..., Q) as all rows have them that know of no spread: with u as they are
+        given one, ``g^T (M + M D M)^-1 g`` is this times ``D^-1 u``, without a difference of large
+        numbers."""
+        inverse = np.linalg.pinv(self.information, rcond=DIRECTION_SEEN, hermitian=True)
+        return (inverse @ self.score[..., None])[..., 0]
 
     def of(self, *groups: int) -> Told:
         """Of one group, or of some, all others being 0; numbered from 0 as they are given."""
@@ -75,8 +96,8 @@ class Told:
 
     def statistic(self, sd: np.ndarray) -> float:
         """Twice the log of the likelihood ratio of the sds (G,) against none."""
-        values, _, log_det = self.given(np.square(sd))
-        return float(np.vdot(self.score, values)) - log_det
+        most = float(np.vdot(self.score, self._by_themselves))
+        return most - self.unlikely(2.0 * np.log(sd))[0]
 
     def given(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """The values (..., Q) and their covariance, given the variances of the groups; and by how
@@ -163,11 +184,23 @@ def _likeliest(
     """The sd (G,) of each group, from a start (G,); no less than `least` (G,)."""
     from scipy.optimize import minimize  # late: it loads much, and most fits need none
 
+    lowest = 2.0 * np.log(LEAST_SD * start if least is None else least)
     first = 2.0 * np.log(start)
-    least = LEAST_SD * start if least is None else least
-    bounds = np.stack([2.0 * np.log(least), first + 2.0 * np.log(LARGEST_SD)], axis=1)
-    best = minimize(unlikely, first, jac=True, method="L-BFGS-B", bounds=bounds, options=PRECISE)
-    return np.exp(best.x / 2.0)
+    most = first + 2.0 * np.log(LARGEST_SD)
+
+    def at(log_variance: np.ndarray) -> tuple[float, np.ndarray]:
+        return unlikely(np.minimum(log_variance, most))
+
+    # With bounds above as well, the first step would be as long as the slope.
+    best = minimize(
+        at,
+        first,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(low, None) for low in lowest],
+        options=PRECISE,
+    )
+    return np.exp(np.minimum(best.x, most) / 2.0)
 
 
 def _sigma(sd: np.ndarray, of_variances: np.ndarray) -> np.ndarray:
@@ -180,13 +213,19 @@ def _sigma(sd: np.ndarray, of_variances: np.ndarray) -> np.ndarray:
 
 
 def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: np.ndarray) -> Told:
-    """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted."""
-    return Told.fitted(
+    """What all rows say of some unknowns by chance; `covariance` is their joint one, as fitted.
+    Ranges count about their mean; of poses, priors of frames say where that is."""
+    out = Told.fitted(
         np.concatenate([values[u.name] for u in some]),
         covariance,
         np.square(np.concatenate([u.sigma for u in some])),
         groups(some),
     )
+    end = 0
+    for unknown in some:
+        start, end = end, end + unknown.dim
+        out = out.about_mean(slice(start, end)) if len(spread_keys(unknown)) == 1 else out
+    return out
 
 
 def groups(some: Sequence[Unknown]) -> np.ndarray:
