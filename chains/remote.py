@@ -116,6 +116,12 @@ def files(folder: Path, pattern: str) -> list[Path]:
     return [folder / way for way in inside if len(way.parts) == depth and way.match(pattern)]
 
 
+def size(path: Path) -> int:
+    """How many bytes a file has, without fetching it where that is known already."""
+    known, _ = _known.get(path, (None, 0))
+    return fetched(path).stat().st_size if known is None else known
+
+
 def fetched(path: Path) -> Path:
     """A file that is here now, if it stands for a URL; any other as it is.
 

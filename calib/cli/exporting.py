@@ -47,7 +47,7 @@ def export(
     opened = Run.open(run, trust or ())
     done = write(opened, out, formats or [], force)
     document = {
-        "warnings": opened.warning,
+        "warnings": opened.before_use,
         "files": [str(file) for file in done.files],
         "not_held": done.not_held,
         "left_out": done.left_out,
@@ -58,7 +58,7 @@ def export(
     from calib.show.tables import print_pairs, terminal
 
     console = terminal()
-    for sentence in (*opened.warning, *map(whole, opened.odd_rings)):
+    for sentence in (*opened.before_use, *map(whole, opened.odd_rings)):
         console.print(sentence)
     for file in done.files:
         console.print(f"wrote {file}", soft_wrap=True)
@@ -99,14 +99,14 @@ def apply(
     with executing(workers, scheduler), progress_bar() as progress:
         done = correct(opened, clouds, out, rig, progress, force)
     document = {
-        "warnings": opened.warning,
+        "warnings": opened.before_use,
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
             | {"not_corrected": a.left_out, "extrapolated": list(a.extrapolated)}
             for a in done
         ],
     }
-    lines = [*opened.doubts, *opened.omissions]
+    lines = [*opened.doubts, *opened.omissions, *opened.found_wrong]
     for a in done:
         lines += a.extrapolated
         lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")

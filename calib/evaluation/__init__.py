@@ -190,7 +190,7 @@ def evaluate(
             lambda some: over_stops(work, [scans[i] for i in some]),
             partial(progress, "evaluating"),
         )
-        return write_evaluation(stops, folder, sources[0].rig.labels, raw, run.warning)
+        return write_evaluation(stops, folder, sources[0].rig.labels, raw, run.before_use)
 
 
 def evaluate_all(

@@ -31,9 +31,12 @@ Columns = dict[str, np.ndarray]
 KnownOfBeams = Callable[
     [Beams], Mapping[str, np.ndarray]
 ]  # beams of points -> what else is known of them
-NEIGHBOURS = 24  # of a point, through which its plane is laid
+NEIGHBOURS = 24, 12  # of a point, through which its plane is laid; nearer ones where that is none
 SUPPORT = 200_000  # points among which neighbours are sought
-THICKEST = 0.3  # of a plane's width: what is thicker is none
+# How thick a plane may be: so many sigmas of the range, and so much of its width, which turns a
+# normal by 0.05 rad. A choice: the walls of a real room bulge by some 5 mm over a metre.
+THICKEST_SIGMAS, THICKEST = 3.0, 0.05
+DIRECTION_KNOWN_RAD = 0.1  # of a normal: neighbours on one line do not tell it
 FLATTEST_BEAM_RAD = np.radians(85.0)  # flatter beams are corrected as these are
 # Looks at the range: a correction changes by a millionth of itself from each to the next.
 CORRECTION_PASSES = 3
@@ -137,7 +140,10 @@ def correct(
         blind, there["incidence_rad"] = np.isnan(met), np.nan_to_num(met)
         needy = [e.name for e, _ in usable.effects if "incidence_rad" in e.covariates]
         if blind.any():
-            why = f"needs incidence, and {blind.mean():.1%} of the points lie on no plane"
+            why = (
+                f"needs incidence, at {blind.mean():.1%} of the points, which lie on no plane that "
+                "their neighbours show; all others are corrected"
+            )
             left_out |= dict.fromkeys(needy, why)
     reach.look({"range_m": ray.range_m, **_angles(ray), **there})
     corrected_m = usable.apply(xyz_m[seen], there)
@@ -162,23 +168,36 @@ def _incidence(xyz_m: np.ndarray, rig: Rig, met_rad: np.ndarray | None) -> np.nd
 def incidence(xyz_m: np.ndarray, rig: Rig) -> np.ndarray:
     """Incidence (N,) rad of beams on the planes through each point's nearest neighbours.
 
-    The plane's normal is the direction in which the neighbours spread least; NaN where they spread
-    nearly as much along it as along one of the plane's: an edge, or too few of them.
+    The plane's normal is the direction in which the neighbours spread least. NaN where they spread
+    much further along it than ranges err, as at an edge; where they are so near to a line that
+    their noise turns the plane; and where it goes through the LiDAR, as it does where all of them
+    are of one column of a thin scan.
     """
     from scipy.spatial import cKDTree
 
     ray = beams(xyz_m, rig.lidar.beam_origin_m)
     some = xyz_m[:: max(1, len(xyz_m) // SUPPORT)]
-    _, near = cKDTree(some).query(xyz_m, k=min(NEIGHBOURS, len(some)), workers=-1)
-    out = np.empty(len(xyz_m))
+    _, near = cKDTree(some).query(xyz_m, k=min(NEIGHBOURS[0], len(some)), workers=-1)
+    out = np.full(len(xyz_m), np.nan)
     for rows in np.array_split(np.arange(len(xyz_m)), 1 + len(xyz_m) // SUPPORT):
-        away_m = some[near[rows]]
-        away_m -= away_m.mean(axis=1, keepdims=True)
-        variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away_m, away_m))
-        along = np.abs(np.einsum("ni,ni->n", axes[:, :, 0], ray.direction[rows]))
-        plane = variance[:, 0] < THICKEST**2 * variance[:, 1]
-        out[rows] = np.where(plane, np.arccos(np.minimum(along, 1.0)), np.nan)
+        for count in NEIGHBOURS:
+            left = rows[np.isnan(out[rows])]
+            around_m = some[near[left, :count]]
+            out[left] = _on_planes(around_m, ray.direction[left], rig.lidar.sigma_range_m)
     return out
+
+
+def _on_planes(around_m: np.ndarray, direction: np.ndarray, sigma_m: float) -> np.ndarray:
+    """Incidence (N,) of beams of a direction (N, 3) on the plane of points (N, K, 3) around."""
+    count = around_m.shape[1]
+    away_m = around_m - around_m.mean(axis=1, keepdims=True)
+    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away_m, away_m))
+    along = np.abs(np.einsum("ni,ni->n", axes[:, :, 0], direction))
+    thick_m, wide_m = np.sqrt(np.maximum(variance[:, :2], 0.0) / count).T
+    plane = thick_m < THICKEST_SIGMAS * sigma_m + THICKEST * wide_m
+    plane &= sigma_m < DIRECTION_KNOWN_RAD * np.sqrt(count) * wide_m
+    plane &= along > np.cos(FLATTEST_BEAM_RAD)
+    return np.where(plane, np.arccos(np.minimum(along, 1.0)), np.nan)
 
 
 def _angles(ray: Beams) -> Columns:

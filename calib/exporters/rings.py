@@ -83,8 +83,8 @@ def write_hesai(fit: FittedRig, folder: Path) -> Written:
     not_held = [_table(fit), *_not_in_a_table(fit, _turning(fit))]
     beside = fit.file(folder, "hesai_angle_correction.txt")
     write_text(beside, "\n".join([*fit.head((f"Of {path.name}:", *HESAI), not_held), ""]))
-    warning = f"warnings: {'. '.join(fit.run.warning)}"
-    return Written([path, beside], [warning, *not_held] if fit.run.warning else not_held)
+    warning = f"warnings: {'. '.join(fit.run.before_use)}"
+    return Written([path, beside], [warning, *not_held] if fit.run.before_use else not_held)
 
 
 @for_every_rig

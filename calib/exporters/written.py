@@ -36,7 +36,7 @@ def write_text(path: Path, text: str | bytes) -> None:
 
 def warnings(run: Run) -> list[str]:
     """What stands above everything that is written of a run, in short lines."""
-    return [line for sentence in run.warning for line in textwrap.wrap(sentence, LINE_WIDTH)]
+    return [line for sentence in run.before_use for line in textwrap.wrap(sentence, LINE_WIDTH)]
 
 
 def head(run: Run, rig: str, conventions: Iterable[str], not_held: Iterable[str]) -> list[str]:

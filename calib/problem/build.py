@@ -48,6 +48,7 @@ def build(
     for source, terms in zip(sources, problem.terms, strict=True):
         for term in (t for t in terms if not t.effect.widens):
             unknown = effect_unknown(term, source)
+            _refuse_other_hardware(problem.variables.get(unknown.name), unknown, source)
             unknown = unknown.loosened(model.moved.get(unknown.name, 0.0))
             params = term.effect.params(source.rig)
             problem.add(unknown, np.array([params[i].start for i in term.free], float))
@@ -77,6 +78,16 @@ def build(
             "and no LiDAR, or all of it is held"
         )
     return problem
+
+
+def _refuse_other_hardware(known: Unknown | None, unknown: Unknown, source: Source) -> None:
+    """Refuse a recording whose rig has a name, but not the hardware, of one before it."""
+    if known is not None and known.dofs != unknown.dofs:
+        raise InputError(
+            f"{source.recording.folder}: {unknown.owner.effect} has {unknown.dim} parameters here "
+            f"and {known.dim} in a recording before it, so LiDAR, arm or labels are others; call "
+            f"this rig otherwise in rig.yaml than '{source.rig.name}', or fit each alone"
+        )
 
 
 def effect_unknown(term: Term, source: Source) -> Unknown:

@@ -66,6 +66,13 @@ def _earlier_value(problem: Problem, variable: Unknown, solution: Solution) -> n
                 T_cad = tree.edges[tree.edge_names.index(term.effect.name)].T_parent_child
                 return se3.log(se3.inverse(T_cad) @ frame.T_parent_child)[term.free]
             effect = part.effects.get(term.effect.name)
+            names = tuple(p.name for p in term.effect.params(source.rig))
+            if effect and effect.names != names:
+                raise InputError(
+                    f"--prior: {term.effect.name} has {len(effect.names)} parameters in that run "
+                    f"and {len(names)} in {source.recording.folder}, so LiDAR, arm or labels are "
+                    "others; give a run of the same hardware, or none"
+                )
             return effect.estimate[term.free] if effect else None
     frame = solution.shared.frames.get(variable.name)
     return frame.T_parent_child if frame else None

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
 from calib.recalibration.prior import earlier
 from calib.recalibration.refit import solve_from
+from calib.recalibration.twice import refuse_copies, refuse_given_twice, refuse_known
 from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
 from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
@@ -42,6 +42,7 @@ from calib.runs.belief import limits
 from calib.runs.reopen import (
     effects_of_prior,
     identity,
+    known_before,
     model_of,
     proposed,
     reopened,
@@ -102,13 +103,17 @@ def calibrate(
     recordings = outputs.each(recordings)
     inputs = [*recordings, *([prior] if prior else [])]
     with outputs.folder(out, outputs.RUN, inputs) as folder:
-        _refuse_twice([r.resolve() for r in recordings])
+        refuse_given_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings, known=effects_of_prior(prior))
         opened = [Source.open(r).of_beams(model.beams) for r in recordings]
         sources, model = placed(leave_out(opened, model.without), model)
+        refuse_copies(sources)
+        if prior:
+            before = Run.open(prior)
+            before.refuse_unconverged(force=None)
+            refuse_known(sources, known_before(before))
         choices = _Choices(Path(out), hold_out, folds, prior)
         document = _model_document(sources, model, choices)
-        _refuse_copies(document["recordings"])
         with going_on(outputs.kept(folder, document)):
             try:
                 _fit(sources, model, document, folder, choices, progress)
@@ -247,7 +252,8 @@ def _fit(
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
-    summary |= since(links, before.summary) if before else {}
+    if before:
+        summary |= {**since(links, before.summary), "prior_found_wrong": before.found_wrong}
     judged = estimate.loosened(moved_since_cad(summary))
     by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}
@@ -264,20 +270,6 @@ def _fit(
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
-
-
-def _refuse_twice(recordings: Sequence[Path]) -> None:
-    for recording in recordings:
-        if recordings.count(recording) > 1:
-            raise InputError(f"{recording} is given twice; as data it counts once")
-
-
-def _refuse_copies(recordings: Sequence[Mapping[str, str]]) -> None:
-    for one, other in combinations(recordings, 2):
-        if one["sha256"] == other["sha256"]:
-            raise InputError(
-                f"{one['path']} and {other['path']} hold the same; as data they count once"
-            )
 
 
 def _refuse_nothing(problem: Problem, seen: Errors) -> None:

@@ -46,6 +46,10 @@ _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
 RING_NAME = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
+FOUND_WRONG = {
+    "missing_effect": "its diagnosis says that the model lacks an effect",
+    "bad_data": "its diagnosis says that something in the recording is wrong",
+}  # verdicts by which numbers are not to be used as they are
 NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
 
 
@@ -144,6 +148,7 @@ class Run:
     def doubts(self) -> list[str]:
         """Why the fit may not be what it should be, a sentence each."""
         out = [] if self.converged else [NOT_CONVERGED]
+        out += self.summary.get("prior_found_wrong", ())
         if self.set_aside:
             out.append(f"Set aside, as they contradict everything else: {self.listed_aside}.")
         return out
@@ -152,6 +157,20 @@ class Run:
     def warning(self) -> list[str]:
         """What is to stand above everything that is shown of the run, a sentence each."""
         return [*self.doubts, *self.omissions, *self.extrapolated]
+
+    @property
+    def found_wrong(self) -> list[str]:
+        """What its diagnosis found that speaks against its numbers as they are, as a sentence; none
+        where it found nothing of the kind, or was not asked."""
+        found = self.diagnosis() or {"verdict": ""}
+        if found["verdict"] not in FOUND_WRONG:
+            return []
+        return [f"{self.folder}: {FOUND_WRONG[found['verdict']]}: {found['sentences'][0]}"]
+
+    @property
+    def before_use(self) -> list[str]:
+        """What is to stand above what takes numbers from the run for other programs."""
+        return [*self.warning, *self.found_wrong]
 
     @property
     def omissions(self) -> list[str]:
@@ -195,12 +214,14 @@ class Run:
         files = dict.fromkeys(e["python"] for e in effects if "python" in e)
         return [part for file in files for part in ("--trust", str(file))]
 
-    def refuse_unconverged(self, force: bool) -> None:
-        """Raise InputError for a fit that did not converge, unless its numbers are wanted still."""
+    def refuse_unconverged(self, force: bool | None) -> None:
+        """Raise InputError for a fit that did not converge, unless its numbers are wanted still;
+        None where nobody can say that they are."""
         if not (self.converged or force):
+            anyway = "" if force is None else ", --force uses them anyway"
             raise InputError(
                 f"{self.folder} has NOT CONVERGED, so its numbers are not to be used; "
-                f"'rigcal diagnose {self.folder}' looks for what is wrong, --force uses them anyway"
+                f"'rigcal diagnose {self.folder}' looks for what is wrong{anyway}"
             )
 
     def diagnosis(self) -> dict[str, Any] | None:

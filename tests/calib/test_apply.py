@@ -102,6 +102,20 @@ def test_incidence_is_told_by_neighbours(fitted):
     assert np.quantile(off, 0.9) < 8.0
 
 
+def test_incidence_is_not_made_up_where_a_scan_is_thin(fitted):
+    """Of few columns the neighbours of a point are those of its own, on a plane with the LiDAR."""
+    whole, truth, _ = fitted
+    scan = whole.recording.scan(6)
+    columns = np.unique(scan.column)
+    thin = np.isin(scan.column, columns[:: len(columns) // 20])
+    found = incidence(scan.xyz_m[thin], whole.rig)
+    _, hits = off_mesh(whole, truth, 6)
+    told = np.isfinite(found)
+    assert 0.05 < told.mean() < 0.9
+    off = np.degrees(np.abs(found - hits.incidence_rad[thin])[told])
+    assert np.quantile(off, 0.9) < 1.0
+
+
 def test_no_incidence_is_told_of_scattered_points(fitted):
     cloud = np.random.default_rng(0).uniform(-3, 3, (2000, 3))
     assert np.isnan(incidence(cloud, fitted[0].rig)).mean() > 0.9

@@ -3,6 +3,7 @@
 A valid recording is simulated once; every case breaks one thing in a copy of it.
 """
 
+import re
 import shutil
 import sys
 
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 
 from calib.cli import main
+from calib.rig import load_rig
 from calib.simulation import Spec, simulate
+from sensors.recording import read_table, write_table
 
 from .broken import (
     all_of,
@@ -231,6 +234,30 @@ def test_a_copy_of_a_recording_is_refused(rec, refused):
     shutil.copytree(rec, rec.parent / "copy")
     sentence = refused("fit", rec, rec.parent / "copy", "-o", rec.parent / "run")
     assert "rec and " in sentence and "copy hold the same" in sentence
+
+
+def test_scans_that_two_recordings_hold_are_refused(rec, refused):
+    """Whatever else has changed: a stop that one lacks, and digits of its table."""
+    copy = shutil.copytree(rec, rec.parent / "copy")
+    lines = (copy / "stops.csv").read_text().splitlines()
+    digits = re.sub(r"(\d\.\d{6})\d+", r"\1", "\n".join(lines[:-1]))
+    (copy / "stops.csv").write_text(digits)
+    sentence = refused("fit", copy, rec, "-o", rec.parent / "run")
+    assert "hold the same: scans or rows of " in sentence and "count once" in sentence
+
+
+def test_another_lidar_under_the_same_name_is_refused(rec, refused):
+    other = shutil.copytree(rec, rec.parent / "other")
+    for scan in (other / "scans").glob("*.parquet"):
+        table = read_table(scan)
+        write_table(scan, table | {"x": table["x"] * 1.000001})  # no copy
+    text = (other / "rig.yaml").read_text()
+    model = load_rig(rec).lidar.name
+    assert model != "ouster_os0_128_rev6"
+    (other / "rig.yaml").write_text(text.replace(f"model: {model}", "model: ouster_os0_128_rev6"))
+    sentence = refused("fit", rec, other, "-o", rec.parent / "run")
+    assert "ring_range_offset has 128 parameters here and" in sentence
+    assert "call this rig otherwise in rig.yaml" in sentence
 
 
 def test_what_is_no_run_is_not_replaced(rec, refused):

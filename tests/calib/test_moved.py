@@ -323,6 +323,18 @@ def test_what_moved_between_recordings_of_one_fit_is_no_chance(runs, tmp_path):
     assert not found.blunders
 
 
+def test_what_a_run_knows_is_no_news_to_a_fit_from_it(runs, tmp_path):
+    """Its own recording, one that it knows by its own prior, and a part of one: data count once."""
+    home = runs["a"].folder.parent
+    part = shutil.copytree(home / "before", tmp_path / "part")
+    keep(part, ("L00",))
+    for recording, run in (("before", "a"), ("after", "from_a"), ("before", "from_a")):
+        with pytest.raises(InputError, match=r"--prior: .*was fitted to L0.*data count once"):
+            calibrate(home / recording, tmp_path / "run", prior=home / run)
+    with pytest.raises(InputError, match="was fitted to L00P00, L00P01, L00P02 of"):
+        calibrate(part, tmp_path / "run", prior=home / "a")
+
+
 @pytest.mark.slow
 def test_runs_of_one_recording_have_moved_nothing(runs):
     found = moved(runs["a"], runs["grown"])

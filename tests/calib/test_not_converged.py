@@ -10,6 +10,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.simulation import Spec, simulate
 from calib.solve.descent import AT_OPTIMUM
+from chains.errors import InputError
 from sensors.documents import read_yaml
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=2, stops_per_location=3, column_step=250)
@@ -78,6 +79,30 @@ def test_machines_are_told_as_well(loose, rigcal):
         _, out, _ = rigcal(*words, "--json")
         assert SAID in json.loads(out)["warnings"][0], words
     assert json.loads(rigcal("compare", run, "--json")[1])["converged"] == [False]
+
+
+def test_no_fit_takes_it_for_what_is_known(loose, tmp_path):
+    simulate(SPEC, tmp_path / "later", 2)
+    with pytest.raises(InputError, match=f"has {SAID}, so its numbers are not to be used"):
+        calibrate(tmp_path / "later", tmp_path / "run", prior=loose / "run")
+
+
+def test_what_a_diagnosis_found_wrong_is_told_by_all_that_takes_numbers(less, rigcal):
+    """To people, to machines, in every file; not where the diagnosis found the model adequate."""
+    run, told = less / "run", "X is missing: it changes the ranges."
+    takes = ("apply", run, less / "rec", "-o", less / "out"), ("export", run, "-o", less / "files")
+    for verdict, wrong in (("missing_effect", True), ("bad_data", True), ("adequate", False)):
+        found = {"verdict": verdict, "sentences": [told]}
+        with patch.object(Run, "diagnosis", lambda _, found=found: found):
+            for words in takes:
+                code, out, err = rigcal(*words)
+                assert code == 0, err
+                assert (told in " ".join(out.split())) == wrong, words
+                warnings = json.loads(rigcal(*words, "--json")[1])["warnings"]
+                assert any(told in each for each in warnings) == wrong, words
+        for name in ("extrinsics.yaml", "rig.urdf"):
+            text = " ".join((less / "files" / name).read_text().replace("#", "").split())
+            assert (told in text) == wrong, name
 
 
 def test_the_solution_says_it_to_whoever_reads_only_that(loose, less):

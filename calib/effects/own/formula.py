@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -26,6 +27,10 @@ SITE_WORDS = {
 }
 TRACKER = "tracker:"  # before a body's name, as frames go by the same
 Text = Annotated[str, pydantic.Field(min_length=1)]
+# What stands in place of units that numbers of formulas do not have.
+SI = dict.fromkeys(("nm", "um", "µm", "mm", "cm", "km", "inch", "ft"), "m")
+SI |= dict.fromkeys(("deg", "degree", "degrees", "°", "mrad", "urad", "µrad", "arcsec"), "rad")
+LARGEST_VALUE = 1e100  # of a formula: the squares of larger ones overflow
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
 
@@ -66,6 +71,17 @@ class FormulaFile(Document):
     @classmethod
     def _several(cls, basis: Any) -> Any:
         return (basis,) if isinstance(basis, str) else basis
+
+    @pydantic.field_validator("unit")
+    @classmethod
+    def _of_si(cls, unit: str) -> str:
+        for part in re.findall(r"[^\W\d_]+|°", unit):
+            if part in SI:
+                raise ValueError(
+                    f"{unit}: formulas take and give m and rad, so parameters and sigma are in "
+                    f"these too; write {SI[part]} in place of {part}"
+                )
+        return unit
 
     @pydantic.model_validator(mode="after")
     def _named(self) -> Self:
@@ -145,7 +161,7 @@ class FormulaEffect(Effect):
         return tuple(Param(name, self.file.unit, self.file.sigma, at) for name, at in pairs)
 
     def basis(self, view: View) -> np.ndarray:
-        values = [finite(np.atleast_1d(self._value(e, view))) for e in self.expressions]
+        values = [self._value(e, view) for e in self.expressions]
         columns = np.stack(np.broadcast_arrays(*values), axis=-1)
         rows, count = columns.shape
         if self.site is Site.NOISE:
@@ -183,7 +199,10 @@ class FormulaEffect(Effect):
                 raise expression.wrong(f"column {name} has more than one number a row")
             return values.astype(float)
 
-        return expression.value(column)
+        values = finite(np.atleast_1d(expression.value(column)))
+        if (largest := np.max(np.abs(values), initial=0.0)) > LARGEST_VALUE:
+            raise expression.wrong(f"the formula reaches {largest:.0e} here; scale it down")
+        return values
 
     def _site(self) -> Site:
         if self.file.site in BEAM_AXES:
