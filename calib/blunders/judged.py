@@ -32,7 +32,8 @@ STATED = 8.0
 # Of groups that nothing tells apart, that which goes wrong most often is named first: bodies are
 # touched, knocked and occluded, scans mixed up; all joints of an arm are seldom wrong at once.
 LIKELY = ("body", "scan", "target", "level", "frame", "surface", "joints", "rings")
-# Beyond this what a joint does is far from its derivative: no joint is said to be so far off.
+# Beyond this what a joint does is far from its derivative: no joint is said to be so far off. What
+# is half a turn off seems to be by a little more at times.
 LINEAR_RAD = 0.5
 TELLING = 2.0  # sigmas: by convention, from which a size says something
 ALONG = 0.95  # of an offset's length, along one axis, to be said to lie along it
@@ -76,12 +77,13 @@ class Blunder:
     @property
     def possible(self) -> bool:
         """Whether it may be off by so much at all."""
-        return self._turned_rad < (LINEAR_RAD if self.group.kind == "joints" else np.pi)
+        half_a_turn = 0.0 if self.group.kind == "joints" else np.pi
+        return self._turned_rad < half_a_turn + LINEAR_RAD
 
     @property
     def found(self) -> bool:
         """Whether it is to be named: joints, and others only where they may be off by so much, as
-        where nothing fits they would be turned by more than half a turn."""
+        where nothing fits they would be turned by far more than half a turn."""
         return self.p_adjusted < ALPHA_BLUNDER and (self.group.kind == "joints" or self.possible)
 
     @property

@@ -139,7 +139,7 @@ def closing(run: Run) -> list[str]:
     told = "no contradiction to the model; not diagnosed yet"
     unchecked = () if run.converged else list(run.recordings)[:FIRST_CHECKED]
     if reasons := [each for each in verdict.reasons if not each.startswith(UNASKED)]:
-        why, more = reasons[0].partition(": ")[0], len(reasons) - 1
+        why, more = reasons[0], len(reasons) - 1
         others = f" (and {more} more reason{'s' * (more > 1)})" if more else ""
         told = f"{verdict.meaning}; {why}{others}"
     return [

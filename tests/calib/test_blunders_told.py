@@ -7,7 +7,40 @@ import pytest
 
 from calib.blunders import judged, told
 from calib.blunders.shifts import Shift
-from calib.residuals.groups import Group
+from calib.residuals.groups import CAD, Group
+
+
+def far_out(shift):
+    """A blunder beyond doubt."""
+    return judged.Blunder(
+        shift=shift,
+        p_value=1e-6,
+        p_adjusted=1e-6,
+        evidence=50.0,
+        limit=20.0,
+        enough=30.0,
+        detectable={},
+        looks=10,
+    )
+
+
+@pytest.mark.parametrize(("turn", "possible"), [(3.13, True), (3.15, True), (4.0, False)])
+def test_what_is_mounted_the_wrong_way_round_may_seem_turned_by_more_than_half_a_turn(
+    turn, possible
+):
+    """By the part of half a turn that another frame takes up. Noise decides on which side it is."""
+    shift = Shift(
+        group=Group("frame", CAD, "lidar"),
+        statistic=1e6,
+        dof=1,
+        offset=np.array([turn]),
+        covariance=np.full((1, 1), 1e-6),
+        information=np.full((1, 1), 1e6),
+        axes=("rz",),
+        units=("rad",),
+    )
+    blunder = far_out(shift)
+    assert blunder.possible == blunder.found == possible
 
 
 @pytest.mark.parametrize(
@@ -34,16 +67,6 @@ def test_a_blunder_of_which_no_part_is_known_is_told_without_a_size(along, words
         units=units,
     )
     assert shift.statistic > 400
-    blunder = judged.Blunder(
-        shift=shift,
-        p_value=1e-6,
-        p_adjusted=1e-6,
-        evidence=50.0,
-        limit=20.0,
-        enough=30.0,
-        detectable={},
-        looks=10,
-    )
     source = SimpleNamespace(rig=SimpleNamespace(tree=None), reference=None)
-    found = told.document(judged.LeftOut(blunder, rivals=[]), [source])
+    found = told.document(judged.LeftOut(far_out(shift), rivals=[]), [source])
     assert words in found["sentence"] and "against everything else" in found["sentence"]
