@@ -71,6 +71,7 @@ def simulated(rigcal, folder) -> None:
     assert rigcal("simulate", folder / "box.yaml", "-o", folder / "rec", *HIDE)[0] == 0
 
 
+@pytest.mark.long
 def test_every_step_of_what_takes_long_has_its_stage(rigcal, tmp_path):
     """Each stage is reached, in order, by what the commands say themselves."""
     simulated(rigcal, tmp_path)
@@ -88,7 +89,7 @@ def test_every_step_of_what_takes_long_has_its_stage(rigcal, tmp_path):
         assert len(re.findall(r" \d of \d, ", err)) == len(err.splitlines())  # of every step
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_explanation_tells_the_stages_of_each_rung(rigcal, tmp_path):
     simulated(rigcal, tmp_path)
     code, out, err = rigcal("-v", "explain", tmp_path / "rec", "-o", tmp_path / "study")

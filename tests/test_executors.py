@@ -124,7 +124,7 @@ def alone(recording, tmp_path_factory):
     return written(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("way", [way for way in WAYS if way != "one thread"])
 def test_files_are_the_same_byte_by_byte(way, alone, recording, tmp_path):
     folder = prepared(tmp_path / "there", recording)
@@ -178,6 +178,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no
 
 @needs_proc
 @pytest.mark.parametrize("ends", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.long
 def test_no_worker_outlives_a_command_that_is_ended(ends, recording, tmp_path):
     """Ctrl-C goes to all processes of a terminal's session; workers are none of these."""
     prepared(tmp_path / "here", recording)
@@ -196,7 +197,7 @@ def test_no_worker_outlives_a_command_that_is_ended(ends, recording, tmp_path):
 
 
 @needs_proc
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fit_whose_workers_are_killed_ends_as_any_other(recording, tmp_path):
     """Both, one after the other."""
     here, there = (prepared(tmp_path / name, recording) for name in ("here", "there"))
@@ -214,7 +215,7 @@ def test_a_fit_whose_workers_are_killed_ends_as_any_other(recording, tmp_path):
     assert written(here) == written(there)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_of_a_cluster_that_is_killed_changes_nothing(recording, tmp_path):
     here, there = (prepared(tmp_path / name, recording) for name in ("here", "there"))
     with cluster() as found:

@@ -226,7 +226,7 @@ def found_whole(world: World, case: Case, old: dict, new: dict, caplog) -> None:
     assert leftovers(world) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*QUICK, "import", "plot"])
 def test_a_full_disk_is_one_sentence_and_changes_nothing(world, name):
     """No file may grow beyond a few lines, which the system answers as it does a full disk."""
@@ -269,13 +269,13 @@ def around_renames(steps: list[str]) -> list[int]:
     return [*renames, renames[-1] + 1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", QUICK)
 def test_a_command_killed_at_a_rename_leaves_old_or_new(world, name, caplog):
     killed_at_every_step(world, CASES[name], caplog, all_steps=False)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("words", ["fit lean -o leaned", "add seen range_scale -o leaned"])
 def test_a_fit_that_is_killed_goes_on_from_what_it_knows(world, words):
     """To the same bytes, from any of its passes; a fit that is asked anything else knows nothing.

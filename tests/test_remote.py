@@ -63,7 +63,7 @@ def same(found, expected):
     assert [name for name in found if found[name] != expected[name]] == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recording_on_s3_is_the_folder_that_was_put_there(recording, expected, tmp_path):
     server = pytest.importorskip("moto.server", reason="moto is not installed: no S3 is tried")
     pytest.importorskip("s3fs", reason="the extra 'remote' is not installed: no S3 is tried")
@@ -89,7 +89,7 @@ def test_a_recording_on_s3_is_the_folder_that_was_put_there(recording, expected,
         moto.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recording_of_a_web_server_is_the_folder_that_it_shows(recording, expected, tmp_path):
     pytest.importorskip("aiohttp", reason="the extra 'remote' is not installed: no HTTP is tried")
     quiet = type("Quiet", (SimpleHTTPRequestHandler,), {"log_message": lambda *_: None})
@@ -103,7 +103,7 @@ def test_a_recording_of_a_web_server_is_the_folder_that_it_shows(recording, expe
         server.server_close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_recording_by_a_file_url_is_that_folder(recording, expected, tmp_path):
     pytest.importorskip("fsspec", reason="the extra 'remote' is not installed")
     same(written(f"file://{recording}", tmp_path / "there"), expected)

@@ -106,7 +106,7 @@ def without_seconds(path: Path, folder: Path) -> bytes:
     return data
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_are_the_same_byte_by_byte(made):
     one, other = map(written, made)
     assert one.keys() == other.keys() and len(one) > 100

@@ -39,7 +39,7 @@ def test_a_tutorial_shows_output_and_a_figure_that_is_there(name):
     assert ElementTree.parse(ROOT / "docs" / picture).getroot().tag.endswith("svg")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", TUTORIALS)
 def test_a_tutorial_shows_what_is_printed(name, tmp_path):
     """And its figure has the words of the one that its command draws."""

@@ -164,6 +164,21 @@ def of_link(
     }
 
 
+def of_recording(recording: str, other: str) -> dict[str, Any]:
+    """One of several recordings of a rig that no fit comes to an optimum with, in the same form.
+
+    Args:
+        recording: what it is called.
+        other: one that a fit to it alone does.
+    """
+    said = (
+        f"what is wrong is in {recording}: a fit to it alone comes to no optimum, and one to "
+        f"{other} alone does; check, fit and diagnose it by itself"
+    )
+    found = _otherwise("recording", recording, recording, whole(said))
+    return {**found, "recording": recording}
+
+
 def of_part(
     name: str, sources: Sequence[Source], off_m: float, sigma_m: float, p: float
 ) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from calib.residuals.surfaces import Meeting
 from calib.rig import Rig
 from chains.errors import InputError
 
+SAME_CAD = 1e-6  # m and in rotations: beyond how files round
 FREE_SIGMA = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
 
 
@@ -41,6 +42,7 @@ def build(
         InputError: the recording has nothing to start from, lacks what an effect needs, or leaves
             nothing to estimate.
     """
+    _refuse_other_cad(sources)
     several = len({s.rig.name for s in sources}) > 1
     terms = with_members([model.terms(s.rig, several) for s in sources], sources)
     problem = Problem(sources, terms)
@@ -78,6 +80,22 @@ def build(
             "and no LiDAR, or all of it is held"
         )
     return problem
+
+
+def _refuse_other_cad(sources: Sequence[Source]) -> None:
+    """Refuse recordings whose rigs have one name, and differ in where CAD has their frames: what is
+    estimated is how far these are from there."""
+    first: dict[str, Source] = {}
+    for source in sources:
+        other = first.setdefault(source.rig.name, source)
+        pairs = zip(other.rig.tree.edges, source.rig.tree.edges, strict=False)
+        for edge, name in zip(pairs, source.rig.tree.edge_names, strict=False):
+            if not np.allclose(*(each.T_parent_child for each in edge), rtol=0.0, atol=SAME_CAD):
+                raise InputError(
+                    f"{source.recording.folder}: rig.yaml, or its URDF, has {name} elsewhere than "
+                    f"that of {other.recording.folder}, and both are of rig '{source.rig.name}'; "
+                    "give both the right one, or call one rig otherwise"
+                )
 
 
 def _refuse_other_hardware(known: Unknown | None, unknown: Unknown, source: Source) -> None:

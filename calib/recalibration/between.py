@@ -27,6 +27,7 @@ from chains.errors import InputError
 def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dict[str, Any]]:
     """The links that moved between the first recording of a rig and a later one, as blunders of
     `diagnosis.json`: as a fit of the later one, with that of the first as its prior, finds them.
+    Where the fit to all has no optimum, recordings that have none by themselves as well.
 
     Args:
         stand: a model, fitted to all recordings.
@@ -41,10 +42,16 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
     for label, source in named.items():
         of_rigs.setdefault(source.rig.name, []).append(label)
     alarm = ALARM / max(1, len(named) - len(of_rigs))
-    for rig, (first, *later) in of_rigs.items():
-        known = _alone(model, named[first], progress) if later else None
-        for label in later if known else ():
-            for link in _since(known, model, named[label], alarm, progress):
+    for rig, mine in of_rigs.items():
+        if len(mine) == 1:
+            continue
+        ask = mine[:1] if stand.estimate.converged else mine
+        alone = {label: _alone(model, named[label], progress) for label in ask}
+        first = next((label for label, known in alone.items() if known), None)
+        bad = [label for label, known in alone.items() if not known] if first else []
+        yield from (told.of_recording(label, first) for label in bad)
+        for label in (each for each in mine if first not in (None, each) and each not in bad):
+            for link in _since(alone[first], model, named[label], alarm, progress):
                 yield _told(first, label, link, f"{rig}/" if len(of_rigs) > 1 else "")
 
 

@@ -12,7 +12,7 @@ from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.recalibration.links import Link
 from calib.recalibration.newer import NewerData, RefittedPrior, blocks_of, tests
-from calib.recalibration.odds import MoveOdds
+from calib.recalibration.odds import FREEDOMS, MoveOdds
 
 ALARM = 0.01  # chance that anything is called moved when nothing has
 # Odds by which one link explains better than another, from which on it is named alone: "strong"
@@ -59,11 +59,11 @@ def let_go(
     """
     limit = alarm / len(prior.held)
     fits: list[dict[str, float]] = []
-    free: dict[str, float] = {}
-    last = False
+    free, last = {}, False
+    if not (now := fit(prior)).converged:
+        free, now = _from_afar(prior, fit)
     while True:
         held = prior.loosened(free)
-        now = fit(held)
         found = _Moves.of(prior, NewerData.of(held, now), limit).free
         if last or _alike(found, free):
             break
@@ -73,12 +73,24 @@ def let_go(
         if last and _alike(both, free):
             break
         free = both if last else found
+        now = fit(prior.loosened(free))
     data = NewerData.of(held, now.at_least)
     moves = _Moves.of(prior, data, limit)
     if moves.free.keys() != free.keys():
         free = moves.free
         fit(prior.loosened(free))
     return _links(prior, data, moves, free)
+
+
+def _from_afar(
+    prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior]
+) -> tuple[dict[str, float], RefittedPrior]:
+    """A fit from which what moved is told where one that held all to the earlier solution came to
+    no optimum, as where the reference was scanned anew in another frame: one that holds nothing.
+    Where that has none either, the first once more."""
+    every = {v.name: float(FREEDOMS[-1]) for v in prior.held}
+    now = fit(prior.loosened(every))
+    return (every, now) if now.converged else ({}, fit(prior))
 
 
 def _links(

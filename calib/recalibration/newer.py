@@ -23,12 +23,14 @@ class RefittedPrior(NamedTuple):
     ``change`` (P,) is now minus then, as a tangent there; ``graph`` and ``covariance`` (P, P) say
     how well it is known now, as rows that err alone have it and as its intervals have it; and
     ``widened`` (P, P) as they have it where residuals exceed their sigmas; None where they do not.
+    Of a fit that has not ``converged`` none of this says anything.
     """
 
     change: np.ndarray
     graph: np.ndarray
     covariance: np.ndarray
     widened: np.ndarray | None = None
+    converged: bool = True
 
     @property
     def at_least(self) -> RefittedPrior:

@@ -35,7 +35,8 @@ def solve_from(
         held, at_least = (each.of(prior.variables) for each in (known, wide))
         moved, turned = change(prior, estimate.values)
         covariances = (held.graph, held.covariance, at_least.covariance)
-        return RefittedPrior(moved, *(turned @ each @ turned.T for each in covariances))
+        graph, covariance, widest = (turned @ each @ turned.T for each in covariances)
+        return RefittedPrior(moved, graph, covariance, widest, converged=estimate.converged)
 
     links = let_go(prior, fit, alarm)
     return *found[-1], links

@@ -91,9 +91,10 @@ def _found(
     refits = refits and run.summary["rms_mm"]["held_out"] is not None
     refits = refits and run.model["hold_out"] != "none"
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
-    between = list(moved_between(stand, found.looks[-1].stand, progress)) if run.converged else []
-    # What moved once, between two recordings, seems to scatter by chance.
-    found = replace(found, chance=()) if between else found
+    between = list(moved_between(stand, found.looks[-1].stand, progress))
+    if between:  # what moved once, between two recordings, seems to scatter, or contradicts all
+        found, suspect = replace(found, chance=()), []
+        found = found if run.converged else replace(found, looks=found.looks[:1], blunders=())
     result = conclude(
         found,
         falls,

@@ -69,7 +69,7 @@ def test_scipy_gets_the_derivatives_of_its_rows(bench, work):
     np.testing.assert_allclose(found, (ahead - behind) / 2e-4, rtol=0, atol=1e-6 * found.max())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scipy_ends_where_our_steps_end(bench, work):
     frozen = bench.sparse_rows.frozen(work)
     sparse = bench.sparse_rows.SparseRows(frozen)

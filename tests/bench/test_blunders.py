@@ -102,7 +102,7 @@ def test_sizes_of_a_kind_are_in_one_recording():
     assert set(QUICK) <= set(MISHAPS) and QUICK_RIG in RIGS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_case_is_run_from_the_files_to_the_judgement(tmp_path, monkeypatch):
     monkeypatch.setitem(RIGS, "own all", preset("tiny"))  # twelve stops
     null = run(Case("own all", 0), tmp_path, {})

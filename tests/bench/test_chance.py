@@ -123,7 +123,7 @@ def test_what_was_cut_short_is_no_answer():
     assert said(fit, done)["names"] == ["stop_range_scatter"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_case_is_run_from_the_world_to_the_count(monkeypatch):
     monkeypatch.setitem(FAMILIES, "small", {"locations": 3, "stops": 2, "beams": 500})
     result = run(Case("small", 0))

@@ -76,6 +76,7 @@ def test_there_are_as_many_effects_as_were_asked_for():
     assert not has_all("head", ("sin(joint_1)",)) and not has_all("planes", ("label == 2",))
 
 
+@pytest.mark.long
 def test_what_was_hidden_is_in_the_files_at_its_size(small, tmp_path):
     """Against the same world with nothing hidden: the difference is the formula's."""
     null = written(replace(SMALL, formulas=()), tmp_path)
@@ -297,7 +298,7 @@ def test_a_case_is_run_from_the_world_to_the_count(rig, most, tmp_path):
     assert abs(mean_m[0] - mean_m[1]) > 2 * 1e-3 * result["size_mm"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_nothing_is_hidden_the_model_is_at_the_floor():
     result = formulas.run(replace(SMALL, formulas=(), times=0.0))
     assert result["at_floor"] and "form" not in result and not result["oracle"]

@@ -53,7 +53,7 @@ def test_what_is_hidden_is_named(effect):
     assert named(result), (result["verdict"], result["steps"])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_has_no_name_is_called_so():
     result = run(small("unknown", hidden=("lobe",), size_mm=LARGE_MM), baselines=False)
     assert hangs(result), (result["verdict"], result["steps"], result["unnamed"])

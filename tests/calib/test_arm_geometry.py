@@ -75,7 +75,7 @@ def z_of(estimate, truth):
 # ------------------------------------------------------------------------------------------ found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_name_of_eleven_arms_is_found_within_its_sigma(tmp_path):
     """Truths are drawn from the priors, so all intervals should hold, tied parameters too."""
     held, spread = [], []
@@ -176,6 +176,7 @@ def test_bent_links_are_named_and_with_them_the_model_is_adequate(tmp_path, name
 # ------------------------------------------------------------------------------------- recordings
 
 
+@pytest.mark.long
 def test_axes_that_miss_each_other_are_named_first_and_found(shared, tmp_path):
     """Two axes that CAD draws as meeting miss each other by 3 mm, in an independent simulator's
     recording; zeros and lengths are its truth's then, and were not before."""

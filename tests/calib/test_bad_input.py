@@ -260,6 +260,21 @@ def test_another_lidar_under_the_same_name_is_refused(rec, refused):
     assert "call this rig otherwise in rig.yaml" in sentence
 
 
+def test_other_cad_under_the_same_name_is_refused(rec, refused):
+    other = shutil.copytree(rec, rec.parent / "other")
+    text = (other / "rig.yaml").read_text()
+    at = re.search(r"base_markers:.*?xyz_m: \[([^,]*),", text, re.S)
+    assert at
+    (other / "rig.yaml").write_text(text[: at.start(1)] + "0.1" + text[at.end(1) :])
+    for scan in (other / "scans").glob("*.parquet"):
+        table = read_table(scan)
+        write_table(scan, table | {"x": table["x"] * 1.000001})  # no copy
+    sentence = refused("fit", rec, other, "-o", rec.parent / "run")
+    assert (
+        "base_markers elsewhere than that of" in sentence and "call one rig otherwise" in sentence
+    )
+
+
 def test_what_is_no_run_is_not_replaced(rec, refused):
     sentence = refused("fit", rec, "-o", rec)
     assert "rec exists" in sentence and "another folder" in sentence

@@ -61,6 +61,7 @@ def scatter(folder):
     return BeamScatter.of(solve(build([source], Model())))
 
 
+@pytest.mark.long
 def test_what_each_beam_does_by_itself_is_told_from_what_they_have_in_common(sound, tmp_path):
     rng = np.random.default_rng(4)
     noisy = longer(sound, tmp_path / "noisy", lambda t: EXTRA_M * rng.normal(size=len(t["x"])))
@@ -73,7 +74,7 @@ def test_what_each_beam_does_by_itself_is_told_from_what_they_have_in_common(sou
         assert alike.alone < 1 + 0.5 * (alike.times - 1), name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lidar_noisier_than_stated_is_told_as_that_and_lacks_no_effect(sound, tmp_path):
     """It was told as structure that no effect explains, at p = 1, and as scatter of stops."""
     rng = np.random.default_rng(5)

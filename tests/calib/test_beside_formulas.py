@@ -61,6 +61,7 @@ def stand(tmp_path_factory):
     return stand_of(run, quiet)
 
 
+@pytest.mark.long
 def test_scatter_is_judged_beside_a_formula_and_so_are_mishaps(stand):
     done = search(stand, quiet)
     assert {c.effect.name for c in done.chance} > {"stop_range_scatter"}

@@ -331,6 +331,7 @@ def test_no_reading_is_wrong_of_a_joint_all_of_whose_readings_scatter(drawn, mon
     assert drawn.judged(far | {wild: 60.0 * far[wild]}, monkeypatch)[wild].found
 
 
+@pytest.mark.long
 def test_a_shift_of_the_detectable_size_is_found_four_times_in_five(drawn, monkeypatch):
     """Of one group, the others being as they are in the recording, along any of its axes."""
     rng, hits = np.random.default_rng(1), []

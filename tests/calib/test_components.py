@@ -156,6 +156,7 @@ def test_on_one_tracked_body_a_mount_that_gives_is_a_tracker_that_scatters(tmp_p
     assert any("not distinguishable from tracker_scatter" in each for each in found.sentences)
 
 
+@pytest.mark.long
 def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     simulate(
         SPEC.model_copy(update={"locations": 4}), tmp_path / "other", 8, {"stop_range_scatter": 3.0}
@@ -221,7 +222,7 @@ def test_a_fit_goes_on_with_the_spread_that_it_had(worse, effect):
     assert spread_of(again.problem) == pytest.approx(spread_of(estimate.problem))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse):
     source, _ = worse("tracker_scatter", 3.0)
     folder = source.recording.folder
@@ -234,7 +235,7 @@ def test_a_tracker_worse_than_stated_is_named_and_then_nothing_is_missing(worse)
     assert diagnose(grown).verdict == "adequate"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_a_mesh_the_planes_are_no_bodies(tmp_path):
     """Planes are as uneven as the data say; what bodies scatter by is told of bodies alone."""
     spec = SPEC.model_copy(update={"mesh": False, "column_step": 60})

@@ -103,6 +103,7 @@ def fitted(request, tmp_path_factory):
     return source, solve(build([source], Model())), ADDED_TO_ARMS
 
 
+@pytest.mark.long
 def test_adding_an_effect_never_raises_the_cost(fitted):
     source, small, added = fitted
     assert small.converged
@@ -247,7 +248,7 @@ def test_python_refuses_too(tiny, tmp_path, monkeypatch):
         export(run, tmp_path / "out")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_scales_that_swing_about_the_state_come_to_rest(tmp_path):
     """Stops of an XT32 scatter by three times a beam's sigma: the scale of each scan's residuals
     follows the state, and the state the scale. At half the way each time, both come to rest."""
@@ -256,7 +257,7 @@ def test_scales_that_swing_about_the_state_come_to_rest(tmp_path):
     assert estimate.converged and estimate.iterations < 100
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stops_each_far_off_by_itself_have_an_optimum(tmp_path):
     """A wave over time, of 6 mm: the scales of 12 scans drift for 60 passes, and what a step still
     lowers the cost by comes and goes."""
@@ -267,6 +268,7 @@ def test_stops_each_far_off_by_itself_have_an_optimum(tmp_path):
     assert run.summary["converged"] and run.summary["iterations"] < 150
 
 
+@pytest.mark.long
 def test_what_is_out_where_nothing_converges_is_a_suspect_and_no_blunder(
     tiny, tmp_path, monkeypatch
 ):

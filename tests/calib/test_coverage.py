@@ -52,6 +52,7 @@ def rigs(request: pytest.FixtureRequest, once: Once) -> list:
     return [_errors(once(fitted, seed)) for seed in range(1000, 1000 + request.param)]
 
 
+@pytest.mark.long
 def test_intervals_hold(rigs: list) -> None:
     """95 % intervals of links hold in 93 to 97 %, beyond what so few rigs leave to chance.
 

@@ -145,6 +145,7 @@ def good(tmp_path_factory) -> Good:
     return Good(folder=recording, found=found, truth=truth, sigmas=sigmas, passes=sum(taken))
 
 
+@pytest.mark.long
 def test_nothing_is_said_of_a_good_recording(good):
     """Else every case below might be named for another reason."""
     assert good.found["outcome"] == "adequate", good.found
@@ -160,7 +161,7 @@ def kinds() -> list[Any]:
     return out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", kinds())
 def test_damage_is_refused_or_named_or_harmless(good, tmp_path, kind):
     recording, run = shutil.copytree(good.folder, tmp_path / "recording"), tmp_path / "run"

@@ -83,6 +83,7 @@ def numbers(data):
 # ---------------------------------------------------------------------------------------- verdicts
 
 
+@pytest.mark.long
 def test_where_nothing_is_hidden_the_model_is_adequate(studies):
     _, found = studies["null"]
     assert found.verdict == "adequate"

@@ -239,6 +239,7 @@ def test_some_beams_judge_about_as_all_do(looked, name, request):
 
 
 @pytest.mark.parametrize("beams", ["all", "drawn"])
+@pytest.mark.long
 def test_planes_judge_as_a_mesh_does(tmp_path, beams, request):
     """Where no mesh was scanned, beams are drawn from each plane."""
     spec = SMALL.model_copy(update={"mesh": False, "targets": 0, "column_step": 20})

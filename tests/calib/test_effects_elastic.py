@@ -185,7 +185,7 @@ def test_the_mount_bends_down(source):
     assert fall.max() > 2e-5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["arm_payload_sag", "arm_torque_sag"])
 def test_a_joint_that_gives_way_is_named_by_what_it_gives_way_to(tmp_path, name):
     """Gravity alone explains most of a measured torque, and comes first until it is fitted."""

@@ -27,6 +27,7 @@ BUILT_ROUGHLY += ("arm_geometry",)
 
 
 @pytest.mark.parametrize("name", [*SHOWN, "range_cyclic@0.8", "arm_gear_error@3", "mount_slip@300"])
+@pytest.mark.long
 def test_what_is_hidden_is_what_the_rows_explain(tmp_path, name):
     source, truth = hide(tmp_path / "rec", name)
     problem, values, theta = at_truth(source, truth, name)

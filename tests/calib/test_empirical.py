@@ -36,7 +36,7 @@ def run(tmp_path_factory):
     return calibrate([folder / "rec"], folder / "run")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_is_added_by_the_printed_name_and_the_held_out_error_falls(run, rigcal, tmp_path):
     code, said, err = rigcal("diagnose", run.folder)
     assert code == 0, err

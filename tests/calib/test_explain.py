@@ -248,6 +248,7 @@ def times(folder, *rungs):
     }
 
 
+@pytest.mark.long
 def test_the_ladder_falls_to_an_adequate_model(explained):
     folder, found = explained
     assert [s["added"] for s in found.steps] == [[], [HIDDEN]]
@@ -277,6 +278,7 @@ def test_people_read_rungs_ladder_and_verdict(explained, capsys):
     assert "start" in out and f"not added, as the held-out error did not fall: {C}." in out
 
 
+@pytest.mark.long
 def test_an_interrupted_call_takes_up_the_rungs_that_are_there(folder):
     ladder = folder / "ladder"
     before, last = times(ladder, "00"), json.loads((ladder / EXPLANATION).read_text())
@@ -289,6 +291,7 @@ def test_an_interrupted_call_takes_up_the_rungs_that_are_there(folder):
         assert now["held_out_rms_mm"] == pytest.approx(was["held_out_rms_mm"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_rungs_of_another_model_are_made_anew_and_those_above_go(folder):
     """Found with a bias in it, the model needs no further rung."""
     ladder = folder / "ladder"

@@ -179,7 +179,7 @@ def described(small, tmp_path):
     return run, Run.open(above.folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_shows_it_where_it_was_found(described, tmp_path):
     run, _ = described
     written = report([run], tmp_path / "report.html")
@@ -197,7 +197,7 @@ def test_the_report_shows_it_where_it_was_found(described, tmp_path):
     assert plot(evidence, "formula", tmp_path / "formula.png").title == chart.title
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_workbench_shows_it_and_offers_to_add_it(described):
     run, _ = described
     with shown(run.folder) as (watched, _):
@@ -329,7 +329,7 @@ def test_a_span_that_is_none_is_one_sentence(tmp_path, seen, told):
 # ---------------------------------------------------------------------------------------- for real
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_explain_climbs_by_a_formula_and_keeps_it_for_others(tmp_path, rigcal, diagnosed_once):
     """A hump of incidence is in no catalogue. Its file has a page, and fits another recording."""
     (tmp_path / "hump.yaml").write_text(yaml.safe_dump(HUMP))

@@ -73,6 +73,7 @@ def said(folder) -> dict[str, str]:
     return {command: rigcal(command.split(), folder) for command in COMMANDS}
 
 
+@pytest.mark.long
 def test_nothing_that_is_printed_controls_a_terminal(said):
     for command, text in said.items():
         odd = {c for c in text if not (c.isprintable() or c == "\n")}

@@ -336,7 +336,7 @@ def rings_off(world, folder):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ring_zeros_are_honest_where_stops_scatter(tmp_path):
     """Each stop has a range zero of its own, of 1 mm, that no model speaks of. A good fit says 0.1
     mm of its ring zeros; they are several times that off."""

@@ -51,6 +51,7 @@ def look(tmp_path_factory):
     return Stand(source, model, problem, solve(problem)).look(quiet)
 
 
+@pytest.mark.long
 def test_values_move_as_far_as_predicted(look):
     candidate = next(c for c in look.named.candidates if c.effect.name == "incidence_angle_bias")
     rms_mm = {"held_out": 3.0, "fit": 3.0, "noise_floor": 2.0}
@@ -108,6 +109,7 @@ def test_three_stops_bear_out_what_takes_the_error_to_the_expected_one(before_mm
     assert borne_out(None) and borne_out(replace(fall, gain_m2=(1.0, 1.1, 0.9)))
 
 
+@pytest.mark.long
 def test_what_predicts_nothing_before_another_is_in_is_asked_beside_it(tmp_path):
     """Encoders off centre are named first, and stops held out are predicted worse with that as long
     as a walk of 4 mm with intensity is missing."""
@@ -309,7 +311,7 @@ def test_beside_scatter_names_that_leave_most_are_none(
     assert runs._as_held_out(found, {}, Unnamed(), run, quiet) is found, "nothing was held out"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_matters_stands_with_each_finding_and_a_trace_is_said_to_be_one(tmp_path):
     """0.08 mm of 1.6, of a pattern that no value of the calibration is like."""
     simulate(SPEC, tmp_path / "rec", 4, {"azimuth_range_harmonic": 0.03})
@@ -335,6 +337,7 @@ def test_what_single_beams_show_and_no_test_confirms_is_not_called_adequate(look
         assert not any("adequate" in each for each in told.sentences)
 
 
+@pytest.mark.long
 def test_a_joint_whose_zero_slips_is_named_and_not_called_scatter(tmp_path):
     """By a world of its own code: nothing but one joint, from the middle of the session on."""
     world = World(seed=1, locations=5, beams=400, hidden=(("joint_slip", 0.002),))

@@ -49,7 +49,7 @@ def bulged(tmp_path_factory):
     return folder / "rec", moved_m, calibrate([folder / "rec"], folder / "run", Model(), "none")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bulge_is_named_where_it_is(bulged):
     """By 20 mm, over a metre of a wall of several metres; and not as that wall."""
     folder, moved_m, run = bulged
@@ -64,7 +64,7 @@ def test_a_bulge_is_named_where_it_is(bulged):
     assert "along its normal" in worst["sentence"] and "(about " in worst["sentence"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_it_nothing_is_wrong(bulged, tmp_path):
     """And the other patches of that wall are still met."""
     folder, _, run = bulged

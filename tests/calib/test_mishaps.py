@@ -91,7 +91,7 @@ def test_it_is_named_and_sized_and_nothing_else_is(recording, tmp_path, mishap):
     assert abs(estimate - size) < 4 * sigma < size
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_slips_late_is_one_effect_and_not_a_mishap_at_every_stop_after_it(tmp_path):
     spec = SPEC.model_copy(update={"locations": 5, "column_step": 100})
     simulate(spec, tmp_path / "sound", 2)
@@ -105,7 +105,7 @@ def test_what_slips_late_is_one_effect_and_not_a_mishap_at_every_stop_after_it(t
     assert times_s[-4] < step.effect.shape < times_s[-3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lidar_that_turned_on_its_mount_from_a_stop_on_is_that_and_no_joint(tmp_path):
     """It was told as a joint and a body that slipped, each making up for the other."""
     spec = SPEC.model_copy(update={"locations": 5, "column_step": 100})
@@ -119,6 +119,7 @@ def test_a_lidar_that_turned_on_its_mount_from_a_stop_on_is_that_and_no_joint(tm
     assert times_s[7] < step.effect.shape < times_s[8]
 
 
+@pytest.mark.long
 def test_mishaps_of_two_stops_are_no_effect(recording, tmp_path):
     """One effect might explain both: none does, as they have nothing in common."""
     rec = shutil.copytree(recording, tmp_path / "rec")
@@ -167,7 +168,7 @@ def test_what_lasts_is_an_effect_and_what_does_not_a_blunder(
     assert said["outcome"] == ("bad_data" if blunder else "missing_effect")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_explain_leaves_it_out_and_goes_on(recording, tmp_path):
     """A body that is 5 mm off at one stop: a rung of its own, and an adequate model after that."""
     rec = shutil.copytree(recording, tmp_path / "rec")

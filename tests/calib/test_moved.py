@@ -131,6 +131,7 @@ def test_chances_are_chances_where_nothing_moved(world, noise):
     assert draws[0]["unseen"].p_value is None
 
 
+@pytest.mark.long
 def test_what_moved_has_an_honest_sigma(world):
     move = np.zeros(SIZE)
     move[2 * DIM : 3 * DIM] = [0.3, -0.2, 0.25]
@@ -272,7 +273,7 @@ def test_two_plain_runs_tell_what_the_fit_from_the_first_tells(runs):
     assert sentence.startswith("lidar moved ") and sentence.endswith("; nothing else moved.")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_path):
     """By 8 of CAD's sigmas. Only between its markers and the arm's base is the rig's base seen: it
     may be either, and no third."""
@@ -305,7 +306,7 @@ def test_a_body_that_was_knocked_far_is_told_and_its_cad_not_blamed(runs, tmp_pa
     assert not diagnose(run).blunders
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_moved_between_recordings_of_one_fit_is_no_chance(runs, tmp_path):
     """A LiDAR that sat elsewhere in the second of two seemed to sit anew at every stop."""
     folder = runs["a"].folder.parent

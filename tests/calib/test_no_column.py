@@ -14,6 +14,7 @@ from chains.errors import InputError
 DAMP = {"name": "damp", "site": "range", "unit": "m", "sigma": 0.001, "basis": "humidity - 0.5"}
 
 
+@pytest.mark.long
 def test_a_column_that_there_is_not_is_told_with_the_effect_that_looks_at_it(tmp_path):
     """And, of a fit from an earlier run, where that effect comes from."""
     for k, name in enumerate(("monday", "friday")):

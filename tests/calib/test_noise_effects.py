@@ -58,6 +58,7 @@ def test_added_to_a_model_it_ends_where_a_fit_from_the_start_does(tmp_path):
         assert np.abs(added.values[name] - anew.values[name]).max() < 0.02 * sigma.min()
 
 
+@pytest.mark.long
 def test_it_stands_out_where_it_is_and_not_where_it_is_not(tmp_path):
     found = {}
     for size in (0.0, 1.0):

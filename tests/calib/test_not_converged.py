@@ -55,6 +55,7 @@ def _commands(home):
     yield ("apply", run, rec, "-o", out, "--force"), None
 
 
+@pytest.mark.long
 def test_no_command_shows_it_in_silence(loose, rigcal):
     for words, file in _commands(loose):
         code, out, err = rigcal(*words)
@@ -64,6 +65,7 @@ def test_no_command_shows_it_in_silence(loose, rigcal):
         assert "--force" in words or SAID in err, words
 
 
+@pytest.mark.long
 def test_what_was_left_out_is_told_by_all_of_them(less, rigcal):
     for words, file in _commands(less):
         code, out, err = rigcal(*words)

@@ -102,6 +102,7 @@ def write_until(step: int, write, out: Path, exchange: bool, tell) -> None:
         *[(reported, True), (simulated, False), (in_its_own, False), (reported, False)],
     ],
 )
+@pytest.mark.long
 def test_killed_before_any_step_it_is_old_or_new(tmp_path, caplog, write, there, exchange):
     begin = before_all(tmp_path / "begin") if there else tmp_path / "begin"
     begin.mkdir(exist_ok=True)

@@ -64,6 +64,7 @@ def moved(made, tmp_path, effects):
     return rec
 
 
+@pytest.mark.long
 def test_it_is_named_before_the_catalogue(diagnosed):
     _, found = diagnosed
     assert found.verdict == "missing_effect" and found.worth_adding == ["humid_air"]
@@ -74,6 +75,7 @@ def test_it_is_named_before_the_catalogue(diagnosed):
     assert all("document" not in c for c in found.candidates[1:])
 
 
+@pytest.mark.long
 def test_without_it_another_takes_its_place(made, monkeypatch):
     """So that the test above tells something. What has no name is not looked for."""
     monkeypatch.setattr("calib.runs.diagnose.unnamed", lambda *_: Unnamed())
@@ -152,6 +154,7 @@ def test_a_folder_holds_its_formulas_and_runs_nothing(made, tmp_path):
 # ---------------------------------------------------------------------------------------- rig.yaml
 
 
+@pytest.mark.long
 def test_a_rig_names_effects_beside_it(made, tmp_path, rigcal):
     """They are candidates of every diagnosis, and go by their names."""
     rec = moved(made, tmp_path, ["humid.yaml"])
@@ -202,7 +205,7 @@ def test_an_export_has_its_formula(made, diagnosed, tmp_path):
     assert told["arm_link_length"]["formula"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_no_catalogue_has_is_sized_as_an_independent_simulator_made_it(shared, tmp_path):
     """Ranges that depend on ring x temperature, by 15 mm; see the recordings' README. Every third
     stop of thirty is enough for that."""
@@ -235,7 +238,7 @@ def test_a_page_of_ones_own(made, rigcal):
     assert [page["name"] for page in json.loads(said)] == ["humid_air", "dusty_air"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_explain_adds_it_as_a_rung(made, rigcal, tmp_path):
     own = ["--candidates", made / "humid.yaml"]
     code, _, err = rigcal("explain", made / "rec", "-o", tmp_path / "ladder", *own)
@@ -244,7 +247,7 @@ def test_explain_adds_it_as_a_rung(made, rigcal, tmp_path):
     assert [rung["added"] for rung in ladder] == [[], ["humid_air"]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_both_names_of_the_option_are_one(made, rigcal, tmp_path, diagnosed_once):
     run = shutil.copytree(made / "run", tmp_path / "run")
     found = []

@@ -45,6 +45,7 @@ def planner(narrow):
     return planner_of(narrow, "all")
 
 
+@pytest.mark.long
 def test_sigmas_are_as_promised(narrow, tmp_path):
     """Of every parameter within 5 %, where planned stops bring much."""
     plan = calib.plan(narrow, **FEW)
@@ -133,6 +134,7 @@ def test_candidates_turn_all_that_the_arm_can_and_stay_clear_of_the_room(planner
     assert source.reference.distance_m(T[:, :3, 3]).min() > 0.1
 
 
+@pytest.mark.long
 def test_planned_stops_tell_rivals_apart_and_random_ones_less(narrow):
     case = case_of(narrow, "narrow", ("arm_gravity_sag", "arm_joint_scale"), seed=1)
     assert case.now > 10
@@ -253,6 +255,7 @@ def test_rigs_that_cannot_be_planned_for_are_refused(tmp_path, preset, said):
 
 
 @pytest.mark.parametrize("preset", ["arm-tracker", "laser-tracker", "lidar-arm"])
+@pytest.mark.long
 def test_other_rigs_are_planned_for(tmp_path, preset):
     """Under a tracker alone; seen as points from a base that never moves; without a tracker."""
     spec = PRESETS[preset].model_copy(update={"column_step": 64})

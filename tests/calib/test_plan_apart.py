@@ -72,6 +72,7 @@ def plans(once):
     return [calib.plan(run, purpose=",".join(g), candidates=150).document() for g in groups]
 
 
+@pytest.mark.long
 def test_rivals_that_no_stops_tell_apart_are_named_and_take_no_stops_from_others(plans):
     """Where two axes meet, the moment across the one turns the arm about the other: links that bend
     there do what the joint's sag does."""

@@ -27,6 +27,7 @@ def plan(narrow):
     return calib.plan(narrow, stops=3, purpose="all", candidates=60)
 
 
+@pytest.mark.long
 def test_what_would_be_found_after_the_plan_is_found_by_the_stops_it_asks_for(plan, tmp_path):
     """Of every effect that has no rival on paper, and of every kind of mishap."""
     later = planner_of(fitted(followed(plan), tmp_path), "all")
@@ -49,6 +50,7 @@ def test_what_would_be_found_after_the_plan_is_found_by_the_stops_it_asks_for(pl
             assert size.median == pytest.approx(kept.mishaps[kind][unit].median, rel=0.2), kind
 
 
+@pytest.mark.long
 def test_what_is_found_now_is_what_the_diagnosis_says(narrow, plan):
     """Mishaps as a diagnosis has them; effects as well, once there is one."""
     found = calib.diagnose(narrow)
@@ -80,6 +82,7 @@ def test_what_is_found_now_is_what_the_diagnosis_says(narrow, plan):
             assert again.found[1].effects[name] == pytest.approx(ratio * size)
 
 
+@pytest.mark.long
 def test_the_smallest_are_printed_and_are_in_the_document(narrow, rigcal):
     words = ["plan", narrow.folder, "--for", "all", "--stops", 2, "--candidates", 40]
     code, said, _ = rigcal(*words)
@@ -115,6 +118,7 @@ def test_planned_stops_are_told_by_their_numbers(plan):
     assert _told(group, {}) == "~1: base_markers"
 
 
+@pytest.mark.long
 def test_a_diagnosis_and_its_report_carry_a_plan_for_each_thing_they_cannot_tell(
     narrow, rigcal, tmp_path
 ):
@@ -145,6 +149,7 @@ def test_a_diagnosis_and_its_report_carry_a_plan_for_each_thing_they_cannot_tell
     assert "NEVER FOUND: no number of stops of this arm tells range_offset from the model" in told
 
 
+@pytest.mark.long
 def test_no_stops_are_offered_to_a_rig_for_which_none_can_be_planned(tmp_path):
     spec = PRESETS["lidar-tracker"].model_copy(
         update={"column_step": 32, "locations": 2, "stops_per_location": 2}

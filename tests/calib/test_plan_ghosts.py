@@ -70,6 +70,7 @@ def test_a_plan_says_where_the_base_is_to_stand(run):
         assert w**2 + 1 > 1 and abs(qx) < 0.02 and abs(qy) < 0.02  # level
 
 
+@pytest.mark.long
 def test_a_box_of_the_workbench_shows_them(run, rigcal):
     """Where there is a browser."""
     out = run.folder.with_name(f"{run.folder.name}-plan")
@@ -83,6 +84,7 @@ def test_a_box_of_the_workbench_shows_them(run, rigcal):
         assert node is not None and len(stage.ghosts) == 2
 
 
+@pytest.mark.long
 def test_stops_are_planned_on_the_page_and_stand_in_the_room(run):
     """Where there is a browser. What the diagnosis needs is offered with what else there is."""
     calib.diagnose(run)

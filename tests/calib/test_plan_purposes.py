@@ -108,6 +108,7 @@ def test_what_a_stop_tells_where_stops_scatter_is_less_by_what_scatters(narrow):
     assert np.linalg.norm(E - less) > 0.1 * np.linalg.norm(E)
 
 
+@pytest.mark.long
 def test_plans_for_both_are_made_and_are_not_those_for_all(narrow, rigcal):
     poses = {}
     for purpose in ("all", "reliability", "scatter"):

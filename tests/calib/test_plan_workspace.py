@@ -90,6 +90,7 @@ def test_the_lidar_is_predicted_better_than_by_other_stops(narrow):
     assert planner.now.predicted_m > other.predicted_m
 
 
+@pytest.mark.long
 def test_it_is_told_how_well_the_place_is_known(narrow, rigcal):
     plan = calib.plan(narrow, 3, "workspace", candidates=60)
     told = plan.document()["predicted_mm"]

@@ -75,7 +75,7 @@ def moved(folder, body):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("body", sorted(WHERE))
 def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
     run = calibrate([moved(tmp_path / "rec", body)], tmp_path / "run", hold_out="none")
@@ -87,7 +87,7 @@ def test_a_body_that_moves_with_temperature_is_told(tmp_path, body):
     assert f"depends on temperature, as if the tracked body {WHERE[body]} moved" in said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_formula_of_the_range_takes_the_place_of_a_motion(tmp_path):
     run = calibrate([moved(tmp_path / "rec", "mount_markers")], tmp_path / "run")
     diagnosis = diagnose(run)
@@ -95,7 +95,7 @@ def test_no_formula_of_the_range_takes_the_place_of_a_motion(tmp_path):
     assert diagnosis.unexplained[0]["moves"] == "body"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_error_of_azimuth_is_told_as_a_formula_though_it_looks_like_a_motion(tmp_path):
     """In a room of planes `sin(azimuth)` that grows with temperature is nearly the LiDAR going
     sideways; with the formula nothing is left beside it, and with the motion much is."""

@@ -51,6 +51,7 @@ def carried(stop, range_m, azimuth, elevation):
     return np.where(there, 0.6 + 0.05 * np.sin(50 * elevation), range_m)
 
 
+@pytest.mark.long
 def test_nothing_is_found_where_only_mixed_pixels_are_thrown_away(studied):
     found, run = studied("null")
     assert found.explained and not found.structured
@@ -75,6 +76,7 @@ def test_a_sector_is_found_with_its_azimuths_and_its_size(studied, first, last, 
     assert ("short" if by_m < 0 else "long") in found.sentence
 
 
+@pytest.mark.long
 def test_a_sector_is_no_adequate_model_and_its_formula_takes_it_up(studied, tmp_path):
     from calib.runs.add import add
     from sensors.documents import write_yaml
@@ -99,7 +101,7 @@ def test_a_sector_is_no_adequate_model_and_its_formula_takes_it_up(studied, tmp_
     assert left.explained and left.share < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("by_m", [-0.016, 0.025])
 def test_a_step_whose_beams_were_rejected_has_its_name(tmp_path, by_m):
     """Of the beams beyond it 98 % have no weight, and no test of `range_step` is left; a formula is
@@ -142,6 +144,7 @@ def test_many_beams_off_by_one_size_are_no_mixed_pixels_wherever_they_are(studie
 
 
 @pytest.mark.parametrize(("share", "explained"), [(0.03, True), (0.07, False)])
+@pytest.mark.long
 def test_returns_from_anywhere_are_told_where_they_are_many(studied, share, explained):
     """Though near walls read long and far ones short, which no range explains."""
 

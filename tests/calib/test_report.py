@@ -101,6 +101,7 @@ def shown(pages, window):
 # ------------------------------------------------------------------------------------- the browser
 
 
+@pytest.mark.long
 def test_a_browser_shows_every_chart_and_asks_nobody_for_anything(pages, shown):
     page, ids = shown.page, [chart.id for chart in pages[0].contents.charts]
     assert {*ALWAYS, *OF_BEAMS} <= set(ids)

@@ -38,7 +38,7 @@ def odd(folder: Path, name: str) -> tuple[list[Path], Model]:
     return [folder / f"rec{i}" for i in range(len(specs))], model
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "has", "lacks"),
     [

@@ -72,6 +72,7 @@ def told_at(page, name: str) -> list[str]:
 # ---------------------------------------------------------------------------------------- the hover
 
 
+@pytest.mark.long
 def test_every_figure_tells_numbers_of_its_csv_under_the_pointer(page):
     for name in page.eval_on_selector_all("figure", "all => all.map(f => f.id)"):
         told = told_at(page, name)

@@ -75,6 +75,7 @@ def column(page, table: str, heading: str) -> list[str]:
 # ------------------------------------------------------------------------------------- what it says
 
 
+@pytest.mark.long
 def test_poses_are_those_of_the_solution_and_of_the_rig(made, page):
     found = read_yaml(made / "run" / "solution.yaml")[0]["frames"]
     drawn = read_yaml(made / "rec" / "rig.yaml")[0]["frames"]
@@ -219,6 +220,7 @@ def pixels(png: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(png)).convert("L"))
 
 
+@pytest.mark.long
 def test_without_scripts_all_is_there(made, window):
     context = window.page.context.browser.new_context(java_script_enabled=False)
     page = context.new_page()

@@ -65,6 +65,7 @@ def changed(run, name, change):
 
 
 @pytest.mark.parametrize("name", ["first", "second", "deeper/third", "both", "later", "after"])
+@pytest.mark.long
 def test_a_run_is_made_again(folder, name):
     found = reproduce(Run.open(folder / name))
     assert (found.identical, found.versions) == (True, {})

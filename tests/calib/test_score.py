@@ -186,6 +186,7 @@ def test_the_order_of_rows_and_candidates_does_not_matter():
         np.testing.assert_allclose(a.p_value(), b.p_value(), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_an_effect_of_the_smallest_detectable_size_is_found_four_times_out_of_five():
     alpha = 0.001
     sizes = [trial(World(seed), "one").smallest_detectable(1.0, alpha) for seed in range(20)]
@@ -201,6 +202,7 @@ def test_a_signal_widens_the_clusters_that_judge_it_unless_they_are_jackknifed()
     assert after.inflation < 3 < 10 < before.inflation
 
 
+@pytest.mark.long
 def test_intervals_cover():
     z = []
     for seed in range(200):

@@ -36,6 +36,7 @@ def found(folder, seed=1, **hidden):
     return search(stand_of(run, quiet), quiet), truth
 
 
+@pytest.mark.long
 def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
     """A wave of 8 mm between two lengths of the grid, each of which is a third of a period or more
     off at 7 m: beams near and far contradict either."""
@@ -51,6 +52,7 @@ def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
     assert not done.chance
 
 
+@pytest.mark.long
 def test_what_was_named_beside_chance_lets_others_take_its_place(tmp_path):
     """Three effects, none of which explains as much alone as a zero of its own at every stop: all
     are found, one beside the other, and the zeros are not."""
@@ -87,6 +89,7 @@ def test_a_shape_stays_where_the_name_means_what_it_says(tmp_path):
     assert low < grid[0] and high / grid[-1] == pytest.approx(grid[-1] / grid[-2])
 
 
+@pytest.mark.long
 def test_a_drift_that_another_effect_covers_is_no_scatter_of_stops(tmp_path):
     """At first a zero of its own at every stop explains more than any effect alone."""
     done, _ = found(tmp_path, **{"warmup_drift@700": 3.0, "optitrack_distortion": 3.0})
@@ -97,6 +100,7 @@ def test_a_drift_that_another_effect_covers_is_no_scatter_of_stops(tmp_path):
 
 
 @pytest.mark.parametrize("wild", [False, True])
+@pytest.mark.long
 def test_poses_that_scatter_of_the_joints_moves_far_are_no_blunders(tmp_path, wild):
     """One error of a joint moves the tool further at some poses than at others. Before that scatter
     is in the model three poses stand out; a row that was written down wrongly stands out after."""
@@ -113,6 +117,7 @@ def test_poses_that_scatter_of_the_joints_moves_far_are_no_blunders(tmp_path, wi
     assert [each.blunder.group.where for each in done.blunders] == ["p0030"] * wild
 
 
+@pytest.mark.long
 def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
     """Five targets that are 3 mm off take the mesh with them, which then seems shifted."""
     done, _ = found(tmp_path, seed=33, target_scatter=3.0)
@@ -149,6 +154,7 @@ def test_what_slips_does_so_between_two_stops_and_none_of_them_is_a_blunder(tmp_
 
 
 @pytest.mark.parametrize("wild", [False, True])
+@pytest.mark.long
 def test_poses_are_no_blunders_where_one_joint_scatters_more_than_all(tmp_path, wild):
     """Scatter of the joints is one number, and an encoder may be worse than the others: what its
     readings do to a pose is judged as these readings are. A row far beyond them is named."""
@@ -188,6 +194,7 @@ def test_effects_see_bodies_where_the_model_has_them(tmp_path):
 
 
 @pytest.mark.parametrize("arm", ["ur5e", "irb120"])
+@pytest.mark.long
 def test_a_joint_that_slipped_is_not_the_tracker_or_the_mount(tmp_path, arm):
     """What the first joint does to all that is seen a tracker that moved may do as well, and what
     the last does, the mount: with six parameters for one."""

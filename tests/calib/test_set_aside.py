@@ -54,6 +54,7 @@ def test_both_are_named_with_the_stop_at_which_they_were_taken(folder):
     assert wild == TOKENS
 
 
+@pytest.mark.long
 def test_there_is_a_report(run, tmp_path):
     written = report([run], tmp_path / "page.html")
     html = (tmp_path / "page.html").read_text()

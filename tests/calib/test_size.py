@@ -49,6 +49,7 @@ def bench():
         ("model by stop, stops err", 4, 30),
     ],
 )
+@pytest.mark.long
 def test_a_judged_test_has_its_size(bench, family, parameters, stops):
     p = bench.drawn(bench.FAMILIES[family], stops, parameters, DRAWS)["judged"]
     assert LOWEST < np.mean(p < 0.05) < HIGHEST

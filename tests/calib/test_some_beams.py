@@ -140,6 +140,7 @@ def test_the_ladder_says_that_beams_came_to_it(made):
     assert [rung.step for rung in rungs] == ["start", "all beams"]
 
 
+@pytest.mark.long
 def test_an_explanation_by_other_beams_goes_on_from_no_rung(made, tmp_path):
     recording = [made / "rec"]
     for beams in (400, None, 600):

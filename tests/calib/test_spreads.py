@@ -39,6 +39,7 @@ class Mixed:
         return (logs + self.y @ P @ self.y) / 2
 
 
+@pytest.mark.long
 def test_the_spread_has_the_greatest_restricted_likelihood():
     for seed in range(3):
         world = Mixed(seed)

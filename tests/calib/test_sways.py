@@ -42,6 +42,7 @@ def moves(truth):
     return np.sqrt(np.mean(np.sum(np.square(np.concatenate(found)), axis=2), axis=0) * 5 / 4)
 
 
+@pytest.mark.long
 def test_a_base_that_sways_is_no_scatter(tmp_path):
     simulate(SPEC, tmp_path / "rec", 5, {})
     described(tmp_path / "rec", base={"moves": "location"})
@@ -58,6 +59,7 @@ def test_a_base_that_sways_is_no_scatter(tmp_path):
 
 
 @pytest.mark.parametrize("scatter", ["tracker_scatter", "joint_scatter", "stop_pose_scatter"])
+@pytest.mark.long
 def test_scatter_of_a_rig_that_stands_still_is_scatter(tmp_path, scatter):
     """Bodies and scans of one stop contradict each other, wherever the base may stand."""
     simulate(STILL, tmp_path / "rec", 6, {scatter: 5.0})

@@ -67,6 +67,7 @@ def fitted(folder, without=()):
     return solve(build(source, Model.of(None, (), without)))
 
 
+@pytest.mark.long
 def test_the_fit_is_that_without_them(spoilt):
     folder, wrong = spoilt
     ours, theirs = fitted(folder), fitted(folder, sorted(wrong))
@@ -82,6 +83,7 @@ def test_the_fit_is_that_without_them(spoilt):
             assert np.abs(apart / own).max() < 0.01, variable.name
 
 
+@pytest.mark.long
 def test_the_diagnosis_names_them_or_what_they_cannot_be_told_from(spoilt, tmp_path):
     folder, wrong = spoilt
     run = calibrate([folder], tmp_path / "run", hold_out="none")

@@ -105,6 +105,7 @@ def test_bodies_and_targets_are_seen_by_the_same_metre(problem, values):
         np.testing.assert_allclose(after, before, atol=1e-9)
 
 
+@pytest.mark.long
 def test_a_scale_that_all_the_tracker_sees_has_is_named_and_nothing_beside_it(tmp_path):
     """It was told as scatter of targets too, of 1.8 mm in such a recording."""
     simulate(load_spec("tiny"), tmp_path / "rec", 4, {})

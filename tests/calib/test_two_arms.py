@@ -109,6 +109,7 @@ def test_geometry_is_complete_and_minimal_over_both_chains(recording):
         assert rank == full - own, "minimal"
 
 
+@pytest.mark.long
 def test_a_run_of_two_arms_is_diagnosed_shown_and_exported(run, arms, tmp_path):
     rms = run.summary["rms_mm"]
     assert run.summary["converged"] and 0.8 < rms["held_out"] / rms["noise_floor"] < 1.3

@@ -32,6 +32,7 @@ def found(tmp_path_factory):
     return curves(stand_of(run, quiet).look(quiet).unnamed)
 
 
+@pytest.mark.long
 def test_each_lidar_has_its_own_curve_of_every_covariate(found):
     seen = [(curve.covariates, curve.rig) for curve in found]
     assert len(set(seen)) == len(seen)

@@ -113,7 +113,7 @@ def test_places_are_those_of_points_and_of_poses(tmp_path):
     assert unevenly(scans, both).along == "place"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_zone_that_is_off_one_way_does_not_scatter(tmp_path):
     """2 mm in one direction where the arm reaches one corner: something is wrong there."""
     rng, folder = np.random.default_rng(23), tmp_path / "rec"
@@ -140,7 +140,7 @@ def test_few_stops_and_such_as_have_no_time_tell_nothing():
     assert unevenly(some, still) is None and unevenly(some, where).along == "time"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("wild", [False, True])
 def test_a_tracker_that_sees_worse_far_away_has_no_blunders_but_true_ones(tmp_path, wild):
     """Sigmas from half to six times those stated, by the distance: two stops would stand out of

@@ -90,7 +90,7 @@ def dragged(watched: Watched, start: float, end: float) -> None:
     drag(watched, (left, y), (right, y))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_part_of_the_plot_lights_its_beams_in_the_room(run):
     """By dragging and by writing; how many they are and how far off is told; a link keeps it."""
     table = read_table(run.folder / RESIDUALS / "L00P00.parquet")
@@ -265,7 +265,7 @@ def test_extrinsics_are_what_export_writes_and_the_same_bytes_again(run, tmp_pat
     assert found == wanted and "extrinsics.yaml" in found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_arrows_are_ticked_and_files_are_taken_away(run):
     with shown(run.folder) as (watched, page):
         arrows = page.client.scene.get_handle_by_name("/moves")

@@ -51,6 +51,7 @@ def hidden(once) -> Run:
     return run
 
 
+@pytest.mark.long
 def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
     with shown(hidden.folder) as (watched, page):
         first = watched.page.locator("[data-is=findings] tr").nth(1).inner_text()
@@ -92,6 +93,7 @@ def test_the_first_finding_is_added_and_the_ladder_falls(hidden):
         assert page.desk.run.effects == (*hidden.effects[:2], "incidence_angle_bias")
 
 
+@pytest.mark.long
 def test_a_blunder_is_left_out_by_a_click_and_undone(copied):
     """The button of one leaves out that one; what is left out is shown, and Undo goes back."""
     tokens = ["L00P01:base_markers", "L01P01:base_markers"]
@@ -135,6 +137,7 @@ def on_screen(watched: Watched, page: Page) -> np.ndarray:
     return middle + focal * np.stack([x / depth, -y / depth], axis=1)
 
 
+@pytest.mark.long
 def test_a_click_reads_the_point_that_it_meets(small):
     """Once the browser has turned its camera to where it was told to."""
     with shown(small.folder) as (watched, page):
@@ -174,6 +177,7 @@ def test_a_click_reads_the_point_that_it_meets(small):
         assert page.picture.panel.plot.series[-2]["label"] == "clicked"  # in the plot too
 
 
+@pytest.mark.long
 def test_stops_and_colours_are_chosen(small):
     with shown(small.folder) as (watched, page):
         watched.page.get_by_text("mm, short").wait_for()
@@ -200,6 +204,7 @@ def test_stops_and_colours_are_chosen(small):
 
 
 @pytest.mark.parametrize("width", [1400, 700])
+@pytest.mark.long
 def test_the_page_fits_its_window(small, width):
     with shown(small.folder, width=width) as (watched, _):
         assert button(watched, "Refit").is_visible()
@@ -210,6 +215,7 @@ def test_the_page_fits_its_window(small, width):
             assert box["x"] >= 0 and box["x"] + box["width"] <= width
 
 
+@pytest.mark.long
 def test_a_recording_that_is_gone_is_said_on_the_page(small, tmp_path):
     shutil.copytree(small.folder, tmp_path / "run")
     text = (tmp_path / "run" / "model.yaml").read_text()

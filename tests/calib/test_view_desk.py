@@ -264,7 +264,7 @@ def test_a_job_that_cannot_be_done_ends_in_its_sentence(first, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_job_leaves_out_what_rigcal_add_leaves_out(first, tmp_path):
     token = "L01P01:base_markers"
     job = Job(first.folder, Change(tmp_path / "out", without=[token]))
@@ -294,7 +294,7 @@ def test_a_job_that_is_stopped_leaves_nothing(first, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
     from calib.runs.calibrate import grow, grown_model
 
@@ -320,6 +320,7 @@ def test_a_job_makes_the_run_that_rigcal_add_makes(first, tmp_path):
 # ------------------------------------------------------------------------------------ command line
 
 
+@pytest.mark.long
 def test_view_serves_this_machine_alone_and_ends_with_ctrl_c(first):
     command = [*RIGCAL, "view", first.folder, "--no-open"]
     with started([*command, "--json"]) as process:

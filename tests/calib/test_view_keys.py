@@ -32,6 +32,7 @@ def run(once) -> Run:
     return Run.open(once(small_run) / "run")
 
 
+@pytest.mark.long
 def test_keys_go_to_the_next_stop_wherever_the_focus_is(run):
     with shown(run.folder) as (watched, page):
         tab, stops = watched.page, list(page.picture.menu.stop.options)
@@ -68,6 +69,7 @@ def test_keys_go_to_the_next_stop_wherever_the_focus_is(run):
         assert page.picture.menu.stop.value == stops[at]
 
 
+@pytest.mark.long
 def test_letters_go_into_the_field_that_is_being_written(run):
     with shown(run.folder) as (watched, page):
         tab = watched.page
@@ -83,6 +85,7 @@ def test_letters_go_into_the_field_that_is_being_written(run):
         assert value(watched, "Only where") == "ring > -1"
 
 
+@pytest.mark.long
 def test_a_key_comes_after_what_was_used_before_it(run):
     """Also where the page tells of that later than it would of the key."""
     with shown(run.folder) as (watched, page):

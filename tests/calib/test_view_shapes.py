@@ -122,6 +122,7 @@ def test_what_is_to_be_collided_with_stands_in_for_what_cannot_be_read(rig, tmp_
     assert why == "" and len(shapes) == len(links_of(rig))
 
 
+@pytest.mark.long
 def test_shapes_are_drawn_in_the_place_of_lines(run, rig, tmp_path, monkeypatch):
     put(tmp_path, "part.stl")
     mine = with_meshes(rig, tmp_path, "part.stl", scale="0.1 0.1 0.1")

@@ -206,7 +206,7 @@ def near(one: str, other: str) -> bool:
     return looks[0] == looks[1] and np.allclose(*cameras, atol=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
     with shown(other.folder, run.folder) as (watched, _):
         tab = watched.page
@@ -262,7 +262,7 @@ def test_keys_go_from_stop_to_stop_and_a_link_shows_the_same(run, other):
         tab.wait_for_url(re.compile("stop=L00P00"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_formula_of_ones_own_is_tried_and_stops_held_out_answer(once, tmp_path):
     """What was hidden is written as a formula; a wrong one is told beside its box."""
     folder = shutil.copytree(once(hidden) / "run", tmp_path / "run")

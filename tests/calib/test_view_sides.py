@@ -190,7 +190,7 @@ def lit(watched: Watched) -> list[int]:
     return [int(text.split()[0].replace(",", "")) for text in texts]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_runs_stand_side_by_side(runs):
     """In two rooms and two plots, on one scale, through a link and back to one room."""
     with shown(runs / "better", runs / "run") as (watched, page):
@@ -240,7 +240,7 @@ def test_two_runs_stand_side_by_side(runs):
         until(watched, tab.locator(".u-over:visible").count, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_area_of_the_room_lights_its_beams_in_the_plots(runs):
     """How many they are and how far off is told; the same part of the room at the next stop."""
     with shown(runs / "better", runs / "run") as (watched, page):
@@ -281,7 +281,7 @@ def test_an_area_of_the_room_lights_its_beams_in_the_plots(runs):
         button(watched, "Light up all").wait_for(state="hidden")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sizes_are_chosen_and_all_is_taken_away(runs):
     """Plots as figures, the report, and the run's folder."""
     with shown(runs / "better", runs / "run") as (watched, page):

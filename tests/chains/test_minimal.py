@@ -86,6 +86,7 @@ def rank(columns):
 
 @pytest.mark.parametrize("drawn", ["as printed", "in any frame"])
 @pytest.mark.parametrize("name", TABLES)
+@pytest.mark.long
 def test_all_that_geometry_can_be_and_nothing_twice(tmp_path, name, drawn):
     """Rank of all names together is 4 R + 2 P + 6, and each way here adds one to it."""
     edges = edges_of(tmp_path, name)

@@ -245,7 +245,7 @@ def whole(tmp_path_factory):
     return study(out, scale), out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_graph_predicts_better_than_paper_and_the_sequence(whole):
     methods = whole[0]["sensors"]["XT"]["methods"]
     paper, ours, graph = (methods[m] for m in ("on paper", "the study's sequence", "joint graph"))

@@ -41,12 +41,14 @@ def faults(reader, sample: Sample, seeds: range) -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_whole_files_are_read(reader, made):
     assert len(made) > 50
     refused = [(s.path.name, o.said) for s in made if (o := reader.read(s)).outcome != "read"]
     assert not refused
 
 
+@pytest.mark.long
 def test_damaged_files(reader, made):
     found = [fault for sample in made for fault in faults(reader, sample, SEEDS)]
     assert not found, "\n".join(found)

@@ -41,6 +41,7 @@ def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
     assert all(sag.estimate[i] > 10 * sag.sigma[i] for i in (lift, elbow)), "and it droops"
 
 
+@pytest.mark.long
 def test_a_base_that_creeps_is_what_creeps(shared, tmp_path):
     """Of another program's arm; a mount that creeps explains less."""
     run = calibrate([shared / "recordings/arm_base_creeps"], tmp_path / "run")
@@ -55,6 +56,7 @@ def test_a_base_that_creeps_is_what_creeps(shared, tmp_path):
     assert grown.summary["rms_mm"]["held_out"] < 0.5 * run.summary["rms_mm"]["held_out"]
 
 
+@pytest.mark.long
 def test_dark_beams_that_were_rejected_are_no_matter_of_what_paint_they_hit(shared, tmp_path):
     """Paints differ in how dark they are: an offset by paint takes in most of a step of 48 mm, and
     the dark beams of bright paints are rejected beside it."""
@@ -75,6 +77,7 @@ def test_dark_beams_that_were_rejected_are_no_matter_of_what_paint_they_hit(shar
 
 
 @pytest.mark.parametrize("kind", ["qt64", "ouster"])
+@pytest.mark.long
 def test_a_single_pose_proves_no_ring_offset(shared, tmp_path, kind):
     """A pattern over the rings repeats within a plane, and does not carry to the next."""
     if kind == "ouster":

@@ -16,6 +16,7 @@ from . import foreign
 GEOMETRIC = Model(("arm_link_length", "arm_joint_offset", "arm_axis_tilt"))
 
 
+@pytest.mark.long
 def test_ur10(shared, tmp_path):
     """A geometric model takes the held-out position error of this arm from 0.7 to 0.4 mm."""
     recording = foreign.ur10("A", shared / "arms/ur10_tmac", tmp_path / "ur10", max_stops=2000)

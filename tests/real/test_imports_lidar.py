@@ -56,6 +56,7 @@ def hesai(shared):
         ("xt32m", 32, 2000, 0.984),
     ],
 )
+@pytest.mark.long
 def test_hesai_packets_are_the_decoders_points(model, rings, columns, same, hesai):
     found, decoded, cloud = hesai(model)
     assert found.lidar["columns"] == columns and len(found.lidar["elevation_deg"]) == rings
@@ -185,7 +186,7 @@ def test_where_an_ousters_beams_start_is_seen_in_its_points(shared):
         assert origin.height_m == pytest.approx(0, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_file_ends_in_a_traceback(shared):
     """Whatever kind it is called."""
     files = sorted(path for path in (shared / "lidar").rglob("*") if path.is_file())

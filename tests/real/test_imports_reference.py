@@ -43,6 +43,7 @@ def largest_plane(points):
     return normal, mean
 
 
+@pytest.mark.long
 def test_every_point_is_read(points, found):
     assert len(points) == 155_201
     assert any("155201 points; m, z up" in line for line in found.understood)

@@ -112,6 +112,7 @@ def planted(shared, folder, error):
     return folder
 
 
+@pytest.mark.long
 def test_an_error_of_a_joint_is_found_with_its_formula(shared, tmp_path):
     """In a recording of another simulator: of two other joints, as no catalogue has it."""
     folder = planted(

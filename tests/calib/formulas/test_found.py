@@ -239,7 +239,7 @@ def test_amplitude_and_phase_are_as_well_known_as_sine_and_cosine_together(corre
         assert int(last) * unit == pytest.approx(true, abs=0.5 * unit + 0.05 * true), told
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sigmas_cover():
     """Errors in their sigmas, of 40 worlds; in every other stops scatter. Of the wave both the sine
     and the cosine are there."""
@@ -263,6 +263,7 @@ def test_sigmas_cover():
     assert np.mean(z, axis=0) == pytest.approx(np.zeros(3), abs=0.5)
 
 
+@pytest.mark.long
 def test_an_edge_is_told_no_closer_than_the_values_beside_it():
     """Errors of a window's edges in their sigmas, of 30 worlds; a ring's edge lies midway."""
     edges, z = np.array([-1.0, 0.5]), []

@@ -29,6 +29,7 @@ def beams(seed, more=lambda c: 0.0):
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.long
 def test_what_locations_have_of_their_own_is_no_form_of_the_time(seed):
     """Single stops would confirm one, as those of a location agree."""
     found, alpha = beams(seed), LEVELS["structure"]
@@ -36,6 +37,7 @@ def test_what_locations_have_of_their_own_is_no_form_of_the_time(seed):
     assert not pursue(found.clustered(LOCATION), alpha, quiet, most=1)
 
 
+@pytest.mark.long
 def test_a_form_is_found_where_locations_err_together():
     found = beams(5, lambda c: 6e-3 * np.sin(2 * c["azimuth_rad"]))
     (step,) = pursue(found.clustered(LOCATION), LEVELS["structure"], quiet)

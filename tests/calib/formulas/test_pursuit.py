@@ -115,6 +115,7 @@ def found():
 
 
 @pytest.mark.parametrize("name", PLANTED)
+@pytest.mark.long
 def test_a_planted_form_is_found_over_its_covariates_alone(found, name):
     _, covariates = PLANTED[name]
     _, steps, formulas = found(name)

@@ -106,6 +106,7 @@ def test_the_right_covariates_come_first(names):
     assert 1.0 <= found[0].looks < len(found)
 
 
+@pytest.mark.long
 def test_stops_that_are_few_confirm_a_joint_that_turns_beside_azimuth():
     """A joint has two knots in 30 stops, which do not see a cosine; its own sine and cosine do."""
 

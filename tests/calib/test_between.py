@@ -1,0 +1,87 @@
+"""What several recordings of a rig contradict each other by, where no fit takes them together."""
+
+import shutil
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from calib import diagnose, fit
+from calib.runs.calibrate import calibrate
+from chains import se3
+
+from ..mishaps import Scene
+from .bumps import bumped
+
+ANEW = np.array([0.0, 0.0, 0.4, 0.5, -0.3, 0.1])  # rad, m: where the scanner stood the other time
+
+
+def scanned_anew(recording, by=ANEW):
+    """Mesh and spheres in another frame of the scanner."""
+    T = se3.exp(by)
+    path = str(recording / "reference/mesh.ply")
+    o3d.io.write_triangle_mesh(path, o3d.io.read_triangle_mesh(path).transform(T))
+    with Scene(recording, np.random.default_rng()).sheet("targets.csv") as targets:
+        names = [f"faro_{axis}" for axis in "xyz"]
+        at = np.stack([np.array(targets.columns[n], float) for n in names], axis=1)
+        for name, column in zip(names, se3.apply(T, at).T, strict=True):
+            targets.columns[name] = [repr(x) for x in column.tolist()]
+
+
+def mirrored(recording):
+    """The tracker's y the other way round, for bodies as for targets."""
+    scene = Scene(recording, np.random.default_rng())
+    for sheet, ends in (("stops.csv", (".y", ".qx", ".qz")), ("targets.csv", ("er_y",))):
+        with scene.sheet(sheet) as table:
+            for name in (n for n in table.columns if n.endswith(ends)):
+                column = table.columns[name]
+                table.columns[name] = [repr(-float(x)) if x != "" else x for x in column]
+
+
+def rewrite(recording):
+    """Other noise, a thousandth of a millimetre: no copy of what is known."""
+    rng = np.random.default_rng(1)
+
+    def jittered(scan):
+        return scan | {"x": scan["x"] + rng.normal(0.0, 1e-6, len(scan["x"]))}
+
+    Scene(recording, rng).each_scan(jittered)
+
+
+@pytest.fixture
+def home(once):
+    return once(bumped)
+
+
+def test_a_reference_that_was_scanned_anew_is_what_moved(home, tmp_path):
+    """Half a metre away, where no fit that holds the earlier frame comes to an optimum."""
+    later = shutil.copytree(home / "before", tmp_path / "later")
+    scanned_anew(later)
+    rewrite(later)
+    run = calibrate(later, tmp_path / "run", hold_out="none", prior=home / "a")
+    assert run.converged
+    (moved,) = [link for link in run.summary["links"] if link["moved"]]
+    assert moved["name"] == "faro"
+    z = (np.abs(moved["change"]) - np.abs(se3.log(se3.inverse(se3.exp(ANEW))))) / moved["sigma"]
+    assert np.abs(z).max() < 4.0
+
+
+@pytest.mark.long
+def test_in_one_fit_it_is_what_is_wrong(home, tmp_path):
+    """And no scan, body or part of the mesh of either recording."""
+    scanned_anew(home / "after")
+    run = fit([home / "before", home / "after"], tmp_path / "run", hold_out="none")
+    assert not run.converged
+    found = diagnose(run)
+    assert {each["name"] for each in found.blunders} == {"faro", "lidar"}  # that was bumped, too
+    assert found.verdict == "bad_data"
+
+
+@pytest.mark.long
+def test_a_recording_that_fits_nothing_by_itself_is_named(home, tmp_path):
+    mirrored(home / "after")
+    run = fit([home / "before", home / "after"], tmp_path / "run", hold_out="none")
+    assert not run.converged
+    (bad,) = diagnose(run).blunders
+    assert (bad["kind"], bad["recording"]) == ("recording", "after")
+    assert bad["sentence"].startswith("What is wrong is in after: a fit to it alone comes to no")
