@@ -1,6 +1,6 @@
 # make demo       hides an effect in a simulated recording, finds it, adds it, reports it, in demo/
 # make test       checks style and runs every test but the long ones
-# make test-long  runs the long ones: how often intervals hold, what else is found by its name
+# make test-long  runs the long ones, half an hour: diagnoses, browsers, how often intervals hold
 # make bench-hidden  counts false alarms, intervals that hold, effects found by name; CASES=4 of each kind
 # make docs       builds the site of docs/ in build/docs
 # make clean      removes what these made

@@ -164,7 +164,7 @@ def test_two_series_of_a_ur10_give_one_formula(shared, tmp_path):
     assert after[1] < 0.8 * before[1] and after[3] > 1.1 * before[3]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_study_in_short_ranks_the_methods(tmp_path):
     said = script(ROOT / "examples/paper_study.py", [tmp_path, "--quick"], tmp_path)
     errors = re.findall(r"^Ouster6 .* held out +(\S+) mm", said, flags=re.M)

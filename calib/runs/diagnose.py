@@ -84,8 +84,7 @@ def _found(
     # rejected for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
     suspect = []
-    unexplained = not run.converged and not found.looks[-1].stand.estimate.converged
-    if found.blunders and unexplained:
+    if found.blunders and not (run.converged or found.looks[-1].stand.estimate.converged):
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits = refits and run.summary["rms_mm"]["held_out"] is not None
@@ -93,8 +92,8 @@ def _found(
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
     between = list(moved_between(stand, found.looks[-1].stand, progress))
     if between:  # what moved once, between two recordings, seems to scatter, or contradicts all
-        found, suspect = replace(found, chance=()), []
-        found = found if run.converged else replace(found, looks=found.looks[:1], blunders=())
+        kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
+        found, suspect = replace(found, chance=(), **kept), []
     result = conclude(
         found,
         falls,

@@ -63,6 +63,7 @@ def test_intervals_hold(rigs: list) -> None:
     assert 0.93 - chance < held.mean() < 0.97 + chance
 
 
+@pytest.mark.long
 def test_ring_intervals_hold(rigs: list) -> None:
     """Rings of one rig share its range zero: the share of intervals that hold varies by rig."""
     held = np.array([np.mean(np.abs(rings) < 1.96) for _, rings, *_ in rigs])

@@ -184,7 +184,7 @@ def test_damage_is_refused_or_named_or_harmless(good, tmp_path, kind):
         assert moved < UNCHANGED, f"calm, and an estimate is off by {moved:.1f} sigma"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_damage_takes_long(good):
     """What was run above, refusals too, in passes: seconds are as the machine is."""
     if len(PASSES) < ENOUGH:

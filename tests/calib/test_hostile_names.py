@@ -81,6 +81,7 @@ def test_nothing_that_is_printed_controls_a_terminal(said):
     assert "[bold]" in said["check rec"] + said["fit rec -o run"] + said["diagnose run --no-refits"]
 
 
+@pytest.mark.long
 def test_a_refusal_and_a_result_are_printed_as_letters(folder, tmp_path):
     shutil.copytree(folder / "plain", tmp_path / "rec")
     stops = (tmp_path / "rec" / "stops.csv").read_text()
@@ -157,7 +158,7 @@ def violations(watched: Watched) -> int:
     return sum("Content Security Policy" in error for error in watched.errors)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_opens_no_dialog_runs_its_own_script_alone_and_loads_nothing(page):
     with browser_page() as watched:
         dialogs, asked = opened(watched, page)

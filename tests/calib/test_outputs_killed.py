@@ -153,6 +153,7 @@ def only_parts_are_left(world: Path) -> bool:
 
 @pytest.mark.parametrize("again", [in_parts, in_other_parts], ids=["same", "other"])
 @pytest.mark.parametrize("exchange", [True, False], ids=["exchange", "aside"])
+@pytest.mark.long
 def test_parts_that_were_done_are_used_by_the_same_command(tmp_path, caplog, exchange, again):
     """Killed before any step; and the next one is asked the same, or something else."""
     caplog.set_level("INFO", "rigcal")

@@ -68,6 +68,7 @@ def only_the_tip(rig):
         ("joint_1", "joint_2", "joint_3"),
     ],
 )
+@pytest.mark.long
 def test_where_the_base_stands_still_nothing_before_the_joints_need_be_seen(tmp_path, passive):
     """But for where the first joint's zero is, which goes with where the base stands."""
     read = Source.open(simulated(tmp_path / "read", seed=4, base_moves="never")).recording.joints

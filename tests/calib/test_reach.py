@@ -33,6 +33,7 @@ def estimates(there):
     return names, (np.linalg.solve(R.T, np.eye(len(size))[:, mine]).T / size[mine, None]) @ Q.T
 
 
+@pytest.mark.long
 def test_no_unseen_mishap_moves_an_estimate_further_and_one_goes_so_far(both):
     case, places = both
     linear, problem = case.linear(gradients=Gradients(len(case.dense.sigma))), case.start.problem

@@ -94,6 +94,7 @@ def test_every_figure_tells_numbers_of_its_csv_under_the_pointer(page):
         ("tracker", " mm\nalong y: "),
     ],
 )
+@pytest.mark.long
 def test_what_is_told_has_its_unit(page, folder, name, part):
     held_out = Run.open(folder / "run").summary["rms_mm"]["held_out"]
     told = told_at(page, name)

@@ -246,6 +246,7 @@ def test_the_smallest_of_many_is_adjusted_to_five_percent():
 
 @pytest.mark.parametrize("name", ["one", "several", "rings"])
 @pytest.mark.parametrize("size", [0.0, 0.05])
+@pytest.mark.long
 def test_the_log_score_is_what_other_rows_gain_by_a_fit(name, size):
     """The same stops once more, with other errors: half the fall of their chi-square by what was
     estimated from the first, on average over draws."""

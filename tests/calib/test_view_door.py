@@ -212,6 +212,7 @@ def pressed(widget: object) -> dict[str, object]:
     return {"type": "GuiUpdateMessage", "uuid": widget._impl.uuid}
 
 
+@pytest.mark.long
 def test_each_browser_has_a_view_of_its_own_and_only_the_key_changes_anything(bench, monkeypatch):
     asked = []
     monkeypatch.setattr("calib.view.bench.Job", lambda *job: asked.append(job) or _Job())

@@ -16,7 +16,7 @@ from ..thinned import thinned
 from . import foreign
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ur10_gives_way_and_errs_with_its_gears(shared, once):
     """Gravity and an error 17 times a turn: what stops that the fit never saw bear out."""
     folder = once(of_a_ur10, shared / "arms/ur10_tmac", "D")

@@ -49,6 +49,7 @@ def test_every_point_is_read(points, found):
     assert any("155201 points; m, z up" in line for line in found.understood)
 
 
+@pytest.mark.long
 def test_the_surface_follows_the_scan(points, found):
     surface = found.surface
     off_m = distance_to_mesh(surface.vertices_m, surface.triangles, points)

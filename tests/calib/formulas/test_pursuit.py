@@ -124,6 +124,7 @@ def test_a_planted_form_is_found_over_its_covariates_alone(found, name):
 
 
 @pytest.mark.parametrize("name", PLANTED)
+@pytest.mark.long
 def test_it_is_worth_what_was_planted(found, name):
     """But for what the model absorbs, ranges are changed by as much; here a tenth may be off."""
     hidden, _ = PLANTED[name]
