@@ -16,11 +16,11 @@ import os
 import re
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 from chains.errors import CutShortError, InputError
 
@@ -116,10 +116,30 @@ def files(folder: Path, pattern: str) -> list[Path]:
     return [folder / way for way in inside if len(way.parts) == depth and way.match(pattern)]
 
 
-def size(path: Path) -> int:
-    """How many bytes a file has, without fetching it where that is known already."""
-    known, _ = _known.get(path, (None, 0))
-    return fetched(path).stat().st_size if known is None else known
+class Digests(NamedTuple):
+    """Of some files.
+
+    Args:
+        whole: SHA-256 (hex) of their names and contents.
+        each: name -> SHA-256 (hex) of the contents of that one.
+    """
+
+    whole: str
+    each: dict[str, str]
+
+
+def digests(folder: Path, patterns: Sequence[str]) -> Digests:
+    """Of the files of a folder that are of any pattern, as of `files`; each is read once."""
+    sha, each = hashlib.sha256(), {}
+    for path in map(fetched, sorted({path for some in patterns for path in files(folder, some)})):
+        name, own = path.relative_to(folder).as_posix(), hashlib.sha256()
+        sha.update(f"{name}\0{path.stat().st_size}\0".encode())
+        with open(path, "rb") as file:
+            while block := file.read(1 << 20):
+                sha.update(block)
+                own.update(block)
+        each[name] = own.hexdigest()
+    return Digests(sha.hexdigest(), each)
 
 
 def fetched(path: Path) -> Path:

@@ -3,7 +3,6 @@
 This is the pyarrow door: `read_table` and `write_table` serve whoever needs a Parquet file.
 """
 
-import hashlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from pyarrow.parquet import ParquetFile
 
 _PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
+_SCANS = "scans/"
 _BATCH_ROWS = 1 << 20  # read at once: bounds the memory
 _FARTHEST_M = 200.0  # median range, as of clouds that are imported: see `sensors.readers.clouds`
 _LARGEST_SPREAD_M = 0.5  # median of a hold, a choice: of LiDARs 0.01 to 0.05 m, in mm 10 to 50
@@ -195,16 +195,15 @@ class RecordedStops:
         return digest(self.folder)
 
 
+def digests(folder: str | Path) -> remote.Digests:
+    """Of the names and contents of a recording's files; and stop -> that of its scan."""
+    whole, each = remote.digests(Path(folder), _PARTS)
+    return remote.Digests(whole, {Path(n).stem: d for n, d in each.items() if n.startswith(_SCANS)})
+
+
 def digest(folder: str | Path) -> str:
-    """Return the SHA-256 (hex) of the names and contents of a recording's files."""
-    folder, sha = Path(folder), hashlib.sha256()
-    files = sorted({path for part in _PARTS for path in remote.files(folder, part)})
-    for path in map(remote.fetched, files):
-        sha.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                sha.update(block)
-    return sha.hexdigest()
+    """The SHA-256 (hex) of the names and contents of a recording's files."""
+    return digests(folder).whole
 
 
 def read_scan(path: str | Path, rings: int | None = None) -> Scan:

@@ -172,8 +172,8 @@ def of_recording(recording: str, other: str) -> dict[str, Any]:
         other: one that a fit to it alone does.
     """
     said = (
-        f"what is wrong is in {recording}: a fit to it alone comes to no optimum, and one to "
-        f"{other} alone does; check, fit and diagnose it by itself"
+        f"a fit to {recording} alone comes to no optimum, and one to {other} alone does: look for "
+        f"what is wrong in {recording} first, by itself"
     )
     found = _otherwise("recording", recording, recording, whole(said))
     return {**found, "recording": recording}
@@ -227,6 +227,9 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
         "indistinguishable_from": [],
         "belongs_to": None,
         "without": None,
+        "size": None,
+        "unit": None,
+        "sigma": None,
         "sentence": sentence,
     }
 

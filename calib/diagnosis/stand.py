@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -124,17 +124,17 @@ class Stand:
         known = [e for e in known if e not in by_rows]
         there = set(self.model.names)
         unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
-        linear, at = self.linearise((*known, *unnamed), progress)
+        linear, at, of_rigs = self.linearise((*known, *unnamed), progress)
         scores = project(linear, linear.candidates, self.spent)
         chance = [e for e in known if e.by_chance]
         named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
         named = screen(scores, named, at)
         rest = screen(scores, unnamed, at, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
-        values = chances(scores, chance, at)
+        values = chances(scores, chance, of_rigs)
         # Where beams are noisier than stated, the mean of those of a stop scatters more as well.
         if any(c.found for c in values) and self.beams.alone > TOLERATED:
-            values = chances(scores, chance, at, self.beams.alone)
+            values = chances(scores, chance, of_rigs, self.beams.alone)
         return Look(
             stand=self,
             linear=linear,
@@ -148,16 +148,18 @@ class Stand:
 
     def linearise(
         self, candidates: Sequence[Effect], progress: Progress
-    ) -> tuple[Linear, dict[str, np.ndarray]]:
-        """All rows with these candidates beside the model, and each one's columns among theirs."""
+    ) -> tuple[Linear, dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
+        """All rows with these candidates beside the model; each one's columns among theirs; and the
+        same apart for each of its unknowns, of which every rig may have one."""
         wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = variables_of(wide, {e.name for e in candidates})
         linear = linearise_with(wide, self.estimate, [*chain(*variables.values())], progress)
         at, start = {}, 0
         for name, theirs in variables.items():
-            size = sum(wide.variables[v].dim for v in theirs)
-            at[name], start = np.arange(start, start + size), start + size
-        return linear, at
+            ends = start + np.cumsum([0, *(wide.variables[v].dim for v in theirs)])
+            at[name] = [np.arange(*each) for each in pairwise(ends.tolist())]
+            start = int(ends[-1])
+        return linear, {name: np.concatenate(each) for name, each in at.items()}, at
 
     def theta(self, effect: Effect) -> np.ndarray:
         """The free parameters (q,) of an effect of the model."""
@@ -289,7 +291,7 @@ class Look:
         if not effect.shape_name:
             return self, candidate
         shaped = finer(effect, shapes_of(effect, stand.sources))
-        linear, at = stand.linearise(shaped, progress)
+        linear, at, _ = stand.linearise(shaped, progress)
         scores = project(linear, linear.candidates, stand.spent)
         near = screen(scores, shaped, at, self.named.common)
         if not near.candidates:

@@ -171,7 +171,7 @@ def _predicted(
         place_m=(se3.inverse(T_base) @ true.T)[:, :3, 3],
         error=_apart(drawn.T, true.T),
         covariance=_covariance(true, known.together(estimate, list(true.d))),
-        warnings=run.warning,
+        warnings=run.before_use,
     )
 
 

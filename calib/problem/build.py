@@ -18,9 +18,12 @@ from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.groups import CAD
 from calib.residuals.surfaces import Meeting
 from calib.rig import Rig
+from calib.rig.suspect import listed
 from chains.errors import InputError
 
-SAME_CAD = 1e-6  # m and in rotations: beyond how files round
+# m, and in rotations: files that were written with angles to a thousandth of a degree are the same,
+# and no sigma of a frame is as small.
+SAME_CAD = 2e-5
 FREE_SIGMA = 1.0  # m or rad: what is known of a value on paper that is left out, the rig's own size
 
 
@@ -88,9 +91,13 @@ def _refuse_other_cad(sources: Sequence[Source]) -> None:
     first: dict[str, Source] = {}
     for source in sources:
         other = first.setdefault(source.rig.name, source)
-        pairs = zip(other.rig.tree.edges, source.rig.tree.edges, strict=False)
-        for edge, name in zip(pairs, source.rig.tree.edge_names, strict=False):
-            if not np.allclose(*(each.T_parent_child for each in edge), rtol=0.0, atol=SAME_CAD):
+        mine, theirs = (
+            dict(zip(rig.tree.edge_names, rig.tree.edges, strict=True))
+            for rig in (source.rig, other.rig)
+        )
+        for name in (n for n in mine if n in theirs):
+            poses = mine[name].T_parent_child, theirs[name].T_parent_child
+            if not np.allclose(*poses, rtol=0.0, atol=SAME_CAD):
                 raise InputError(
                     f"{source.recording.folder}: rig.yaml, or its URDF, has {name} elsewhere than "
                     f"that of {other.recording.folder}, and both are of rig '{source.rig.name}'; "
@@ -101,9 +108,10 @@ def _refuse_other_cad(sources: Sequence[Source]) -> None:
 def _refuse_other_hardware(known: Unknown | None, unknown: Unknown, source: Source) -> None:
     """Refuse a recording whose rig has a name, but not the hardware, of one before it."""
     if known is not None and known.dofs != unknown.dofs:
+        of_one = sorted(set(known.dofs) ^ set(unknown.dofs)) or ["in another order"]
         raise InputError(
-            f"{source.recording.folder}: {unknown.owner.effect} has {unknown.dim} parameters here "
-            f"and {known.dim} in a recording before it, so LiDAR, arm or labels are others; call "
+            f"{source.recording.folder}: {unknown.owner.effect} has other parameters here than in "
+            f"a recording before it ({listed(of_one)}), so LiDAR, arm or labels are others; call "
             f"this rig otherwise in rig.yaml than '{source.rig.name}', or fit each alone"
         )
 

@@ -23,6 +23,8 @@ from calib.results.solution import Solution, solution_of
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
+NO_OPTIMUM = "no optimum"  # in place of a solution
+
 
 def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dict[str, Any]]:
     """The links that moved between the first recording of a rig and a later one, as blunders of
@@ -47,8 +49,8 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
             continue
         ask = mine[:1] if stand.estimate.converged else mine
         alone = {label: _alone(model, named[label], progress) for label in ask}
-        first = next((label for label, known in alone.items() if known), None)
-        bad = [label for label, known in alone.items() if not known] if first else []
+        first = next((label for label, known in alone.items() if isinstance(known, Solution)), None)
+        bad = [label for label, known in alone.items() if known is NO_OPTIMUM] if first else []
         yield from (told.of_recording(label, first) for label in bad)
         for label in (each for each in mine if first not in (None, each) and each not in bad):
             for link in _since(alone[first], model, named[label], alarm, progress):
@@ -59,15 +61,15 @@ def _told(first: str, later: str, link: Link, rig: str) -> dict[str, Any]:
     """As a blunder, by the parameter, or the mean of them, that shows it best."""
     best = int(np.argmax(np.abs(link.change) / link.sigma))
     way = link.parameters[best], link.change[best], link.sigma[best], link.units[best]
-    if link.as_one:
+    if link.of_mean:
         way = "all alike", *link.of_mean, link.units[0]
     instead = [f"{rig}{name}" for name in link.instead]
     return told.of_link(first, later, f"{rig}{link.name}", way, p=link.p_value, instead=instead)
 
 
-def _alone(model: Model, source: Source, progress: Progress) -> Solution | None:
-    """What one recording alone knows; None where it has nothing to start from, lacks what an effect
-    needs, or its fit comes to no optimum."""
+def _alone(model: Model, source: Source, progress: Progress) -> Solution | str | None:
+    """What one recording alone knows; `NO_OPTIMUM` where its fit comes to none; None where it has
+    nothing to start from, or lacks what an effect needs."""
     try:
         problem = build([source], model)
         estimate = solve(problem, progress=progress)
@@ -75,7 +77,7 @@ def _alone(model: Model, source: Source, progress: Progress) -> Solution | None:
         return None
     seen = errors_at(estimate.problem, estimate.values)
     known = widened(intervals(shapes_freed(estimate, model), progress), estimate, seen)
-    return solution_of(problem, estimate, known) if estimate.converged else None
+    return solution_of(problem, estimate, known) if estimate.converged else NO_OPTIMUM
 
 
 def _since(

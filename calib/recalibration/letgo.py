@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
@@ -18,6 +19,7 @@ ALARM = 0.01  # chance that anything is called moved when nothing has
 # Odds by which one link explains better than another, from which on it is named alone: "strong"
 # evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
 STRONG_ODDS = 20.0
+UNLIKE = 0.01  # chance that rings that changed alike are not told to have done so
 # Of one recalibration, until it settles: one where nothing moved, two where data stay as they are.
 MOST_FITS = 4
 
@@ -74,6 +76,7 @@ def let_go(
             break
         free = both if last else found
         now = fit(prior.loosened(free))
+        last = last or not now.converged
     data = NewerData.of(held, now.at_least)
     moves = _Moves.of(prior, data, limit)
     if moves.free.keys() != free.keys():
@@ -191,7 +194,6 @@ def _link(
         covariance = G @ covariance @ G.T + D - G[:, k] @ D
     else:
         change, covariance = change[k], covariance[k, k]
-    of_mean = float(change.mean()), float(np.sqrt(covariance.mean()))
     return Link(
         name=variable.name,
         moved=freed > 0.0,
@@ -200,5 +202,15 @@ def _link(
         sigma=np.sqrt(np.diag(covariance)),
         parameters=variable.dofs,
         units=variable.units,
-        of_mean=of_mean if variable.of_members else (),
+        of_mean=_of_mean(change, covariance) if freed and variable.of_members else (),
     )
+
+
+def _of_mean(change: np.ndarray, covariance: np.ndarray) -> tuple[float, ...]:
+    """The mean change and its sigma, where single ones differ from it by chance; else empty."""
+    mean, sigma = float(change.mean()), float(np.sqrt(covariance.mean()))
+    apart = np.eye(len(change))[1:] - 1.0 / len(change)  # all but one of the differences
+    rest = apart @ change
+    statistic = rest @ np.linalg.solve(apart @ covariance @ apart.T, rest)
+    alike = len(rest) == 0 or float(chdtrc(len(rest), statistic)) > UNLIKE
+    return (mean, sigma) if alike else ()

@@ -26,8 +26,8 @@ class Link:
         units: (n,).
         freed: by how many of CAD's sigmas the fit let it go from the earlier value; 0 where held.
         instead: links of which one may have moved in its place: the data cannot tell.
-        of_mean: of what is one quantity of several rings or labels, the change of their mean and
-            the sigma of that; empty of all others.
+        of_mean: of what is one quantity of several rings or labels, and has changed alike, the
+            change of their mean and the sigma of that; else empty.
     """
 
     name: str
@@ -41,13 +41,6 @@ class Link:
     instead: tuple[str, ...] = ()
     of_mean: tuple[float, ...] = ()
 
-    @property
-    def as_one(self) -> bool:
-        """Whether the mean shows the change better than any parameter does."""
-        if not self.of_mean:
-            return False
-        return abs(self.of_mean[0]) / self.of_mean[1] > np.max(np.abs(self.change) / self.sigma)
-
     def document(self) -> dict[str, Any]:
         """As summary.json holds it."""
         return {
@@ -60,7 +53,7 @@ class Link:
             "sigma": self.sigma,
             "freed": self.freed,
             "instead": self.instead,
-            "of_mean": self.of_mean if self.as_one else (),
+            "of_mean": self.of_mean,
         }
 
 

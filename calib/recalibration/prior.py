@@ -12,6 +12,7 @@ from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.results.solution import Solution
+from calib.rig.suspect import listed
 from chains import se3
 from chains.errors import InputError
 
@@ -68,9 +69,10 @@ def _earlier_value(problem: Problem, variable: Unknown, solution: Solution) -> n
             effect = part.effects.get(term.effect.name)
             names = tuple(p.name for p in term.effect.params(source.rig))
             if effect and effect.names != names:
+                of_one = sorted(set(effect.names) ^ set(names)) or ["in another order"]
                 raise InputError(
-                    f"--prior: {term.effect.name} has {len(effect.names)} parameters in that run "
-                    f"and {len(names)} in {source.recording.folder}, so LiDAR, arm or labels are "
+                    f"--prior: {term.effect.name} has other parameters in that run than in "
+                    f"{source.recording.folder} ({listed(of_one)}), so LiDAR, arm or labels are "
                     "others; give a run of the same hardware, or none"
                 )
             return effect.estimate[term.free] if effect else None

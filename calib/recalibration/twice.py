@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -12,74 +11,66 @@ import numpy as np
 
 from calib.problem.model import Source
 from calib.rig.suspect import listed
-from chains import remote
 from chains.errors import InputError
 
 
 def refuse_given_twice(recordings: Sequence[Path]) -> None:
-    """Refuse a folder that is given twice."""
+    """Raise InputError for a folder that is given twice."""
     for recording in recordings:
         if recordings.count(recording) > 1:
             raise InputError(f"{recording} is given twice; as data it counts once")
 
 
-def refuse_copies(sources: Sequence[Source]) -> None:
-    """Refuse recordings of a fit that have stops in common."""
-    for one, other in combinations(sources, 2):
-        if same := _in_common(one, other):
-            raise InputError(
-                f"{one.recording.folder} and {other.recording.folder} hold the same: scans or "
-                f"rows of {listed(same)}; as data they count once, so give one of them, or leave "
-                "these stops out of one"
-            )
-
-
-def refuse_known(sources: Sequence[Source], earlier: Mapping[Path, Sequence[Source]]) -> None:
-    """Refuse recordings whose stops an earlier run was fitted to.
+def all_once(
+    sources: Sequence[Source],
+    scans: Sequence[Mapping[str, str]],
+    known: Sequence[str],
+    prior: Path | str | None,
+) -> list[str]:
+    """Digests (hex) of all that an estimate rests on, each of which counts once.
 
     Args:
-        sources: the recordings.
-        earlier: that run, and all that it knew before, each with its recordings.
+        sources: the recordings, without what is left out.
+        scans: of each, stop -> digest of the file of its scan.
+        known: what the estimate of the earlier run rests on that is its prior.
+        prior: where that run is, if there is one.
+
+    Raises:
+        InputError: recordings have measurements in common, or that run knows some of them.
     """
-    for run, of_run in earlier.items():
-        for source, known in ((s, k) for s in sources for k in of_run):
-            if same := _in_common(source, known):
-                raise InputError(
-                    f"--prior: {run} was fitted to {listed(same)} of {source.recording.folder} as "
-                    "well, and data count once; fit without --prior, or, for another model of the "
-                    f"same data, use 'rigcal add {run} EFFECT'"
-                )
+    found = [_measured(source, each) for source, each in zip(sources, scans, strict=True)]
+    for (one, mine), (other, theirs) in combinations(zip(sources, found, strict=True), 2):
+        if same := _among(mine, theirs.values()):
+            raise InputError(
+                f"{one.recording.folder} and {other.recording.folder} hold the same measurements: "
+                f"{listed(same)}; as data they count once, so give one recording, or leave these "
+                "stops out of one"
+            )
+    for source, mine in zip(sources, found, strict=True):
+        if same := _among(mine, known):
+            raise InputError(
+                f"--prior {prior}: its estimate, or that of its own prior, rests on "
+                f"{listed(same)} of {source.recording.folder} already, and data count once; fit "
+                f"without --prior or, for another model of these data, 'rigcal add {prior} EFFECT'"
+            )
+    return sorted({*known, *(digest for each in found for digest in each.values())})
 
 
-def _in_common(one: Source, other: Source) -> list[str]:
-    """The stops of a recording that the other holds too, by whatever name."""
-    theirs = _by_size(other)
-    mine = {size: paths for size, paths in _by_size(one).items() if size in theirs}
-    known = {_contents(path) for size in mine for path in theirs[size].values()}
-    same = {n for paths in mine.values() for n, path in paths.items() if _contents(path) in known}
-    if not (one.rig.lidar or other.rig.lidar):
-        rows = set(_rows(other).values())
-        same = {stop for stop, row in _rows(one).items() if row in rows}
-    return [stop for stop in one.recording.stops if stop in same]
-
-
-def _by_size(source: Source) -> dict[int, dict[str, Path]]:
-    """Size of a file -> the stops whose scans have it, and where these are."""
-    out: dict[int, dict[str, Path]] = defaultdict(dict)
-    stops = set(source.recording.stops)
-    for path in remote.files(source.recording.folder, "scans/*.parquet"):
-        if path.stem in stops:
-            out[remote.size(path)][path.stem] = path
+def _measured(source: Source, scans: Mapping[str, str]) -> dict[str, str]:
+    """Stop -> a digest of what was measured there: of the file of its scan or, where it has none
+    and a body was seen, of its row of joints and poses."""
+    stops, out = source.recording, {}
+    poses = np.hstack(list(stops.bodies.values()) or [np.full((len(stops.stops), 1), np.nan)])
+    rows, seen = np.hstack([stops.joints, poses]), np.isfinite(poses).any(axis=1)
+    for k, name in enumerate(stops.stops):
+        if stops.has_scan[k]:
+            out[name] = scans[name]
+        elif seen[k]:
+            out[name] = hashlib.sha256(rows[k].tobytes()).hexdigest()
     return out
 
 
-def _contents(path: Path) -> bytes:
-    with open(remote.fetched(path), "rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
-
-
-def _rows(source: Source) -> dict[str, bytes]:
-    """What was measured at each stop, beside its scan."""
-    stops = source.recording
-    columns = np.hstack([stops.joints, *stops.bodies.values()])
-    return {name: row.tobytes() for name, row in zip(stops.stops, columns, strict=True)}
+def _among(mine: Mapping[str, str], known: Iterable[str]) -> list[str]:
+    """The stops of which something is known."""
+    known = set(known)
+    return [stop for stop, digest in mine.items() if digest in known]

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
 from calib.recalibration.prior import earlier
 from calib.recalibration.refit import solve_from
-from calib.recalibration.twice import refuse_copies, refuse_given_twice, refuse_known
+from calib.recalibration.twice import all_once, refuse_given_twice
 from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
 from calib.results.holdout import Keep, held_out, unit_of
 from calib.results.intervals import intervals
@@ -42,7 +42,6 @@ from calib.runs.belief import limits
 from calib.runs.reopen import (
     effects_of_prior,
     identity,
-    known_before,
     model_of,
     proposed,
     reopened,
@@ -74,6 +73,7 @@ from calib.solve.fit import Progress, shapes_freed, solve
 from chains import remote
 from chains.errors import InputError, NoColumnError
 from sensors.documents import write_json, write_yaml
+from sensors.recording import digests
 
 
 @one_blas_thread
@@ -107,16 +107,15 @@ def calibrate(
         model = model or Model.of(None, (), (), recordings, known=effects_of_prior(prior))
         opened = [Source.open(r).of_beams(model.beams) for r in recordings]
         sources, model = placed(leave_out(opened, model.without), model)
-        refuse_copies(sources)
-        if prior:
-            before = Run.open(prior)
-            before.refuse_unconverged(force=None)
-            refuse_known(sources, known_before(before))
         choices = _Choices(Path(out), hold_out, folds, prior)
-        document = _model_document(sources, model, choices)
+        if choices.before:
+            choices.before.refuse_unconverged(force=None)
+        contents = [digests(s.recording.folder) for s in sources]
+        document = _model_document(sources, model, choices, contents)
+        data = choices.data(sources, contents)
         with going_on(outputs.kept(folder, document)):
             try:
-                _fit(sources, model, document, folder, choices, progress)
+                _fit(sources, model, document, folder, choices, progress, data)
             except NoColumnError as error:
                 if not prior:
                     raise
@@ -151,9 +150,11 @@ def grow(
         _refuse_idle(model, run, sources)
         hold_out, folds = run.model["hold_out"], run.model["folds"]
         choices = _Choices(Path(out), hold_out, folds, run.prior, grown_from=run)
-        document = _model_document(sources, model, choices)
+        contents = [digests(s.recording.folder) for s in sources]
+        document = _model_document(sources, model, choices, contents)
+        data = choices.data(sources, contents)
         with going_on(outputs.kept(folder, {**document, "grown_from": identity(run)})):
-            _fit(sources, model, document, folder, choices, progress, start)
+            _fit(sources, model, document, folder, choices, progress, data, start)
     return Run.open(out, {**run.trust, **trust_in(model.effects)})
 
 
@@ -212,6 +213,16 @@ class _Choices:
     prior: Path | str | None
     grown_from: Run | None = None
 
+    @cached_property
+    def before(self) -> Run | None:
+        """The run that stands for CAD."""
+        return Run.open(self.prior) if self.prior else None
+
+    def data(self, sources: Sequence[Source], contents: Sequence[remote.Digests]) -> list[str]:
+        """Digests of all that the estimate rests on; see `all_once`."""
+        known = self.before.rests_on if self.before else []
+        return all_once(sources, [each.each for each in contents], known, self.prior)
+
 
 def _fit(
     sources: Sequence[Source],
@@ -220,11 +231,12 @@ def _fit(
     folder: Path,
     choices: _Choices,
     progress: Progress,
+    data: Sequence[str],
     start: Start | None = None,
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
     began, progress = time.monotonic(), staged(progress, FIT)
-    before = Run.open(choices.prior) if choices.prior else None
+    before = choices.before
     problem = problems.build(sources, model)
     held = earlier(problem, before.solution) if before else None
     links: list[Link] = []
@@ -247,13 +259,15 @@ def _fit(
     calibration = known.of([v.name for v in estimate.variables])
     solution = solution_of(problem, estimate, known)
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
-    np.savez(folder / COVARIANCE, names=np.array(solution.names), **arrays)
+    arrays |= {"names": np.array(solution.names), "rests_on": np.array(data, "S64")}
+    np.savez(folder / COVARIANCE, **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
-        summary |= {**since(links, before.summary), "prior_found_wrong": before.found_wrong}
+        summary |= since(links, before.summary)
+        summary["prior_found_wrong"] = [*before.prior_found_wrong, *before.found_wrong]
     judged = estimate.loosened(moved_since_cad(summary))
     by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}
@@ -333,28 +347,32 @@ def _of_all_beams(estimate: Estimate, seen: Errors, unseen: Errors) -> dict[str,
     return out | {f"{kind}rejected_share": errors.rejected_share for kind, errors in kinds.items()}
 
 
-def recordings_document(sources: Sequence[Source]) -> list[dict[str, str]]:
+def recordings_document(
+    sources: Sequence[Source], contents: Sequence[remote.Digests]
+) -> list[dict[str, str]]:
     """Recordings as model.yaml names them: where they are, whose, and what was in them."""
     return [
         {
             "path": remote.url_of(s.recording.folder) or str(s.recording.folder.resolve()),
             "rig": s.rig.name,
-            "sha256": s.recording.digest(),
+            "sha256": each.whole,
         }
-        for s in sources
+        for s, each in zip(sources, contents, strict=True)
     ]
 
 
-def _model_document(sources: Sequence[Source], model: Model, choices: _Choices) -> dict[str, Any]:
+def _model_document(
+    sources: Sequence[Source], model: Model, choices: _Choices, contents: Sequence[remote.Digests]
+) -> dict[str, Any]:
     below = choices.grown_from
     return {
         "format": RUN_FORMAT.newest,
-        "recordings": recordings_document(sources),
+        "recordings": recordings_document(sources, contents),
         **model.document(),
         "hold_out": choices.hold_out,
         "folds": choices.folds,
         "prior": _way(choices.out, Path(choices.prior)) if choices.prior else None,
-        "prior_sha256": solution_digest(Run.open(choices.prior).folder) if choices.prior else None,
+        "prior_sha256": solution_digest(choices.before.folder) if choices.before else None,
         "grown_from": _way(choices.out, below.folder) if below else None,
         "steps": _steps(below) if below else [],
         "versions": versions(),

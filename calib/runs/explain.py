@@ -23,6 +23,7 @@ from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress
 from chains.errors import InputError
 from sensors.documents import plain, write_json, write_yaml
+from sensors.recording import digests
 
 EXPLANATION, KEPT_EFFECTS = "explanation.json", "effects"
 MOST_RUNGS = 8  # a choice: ends a ladder that does not end by itself
@@ -274,7 +275,8 @@ class _Climb:
     @cached_property
     def _told(self) -> list[dict[str, str]]:
         """The recordings as a run's model.yaml has them."""
-        return recordings_document([Source.open(folder) for folder in self.recordings])
+        opened = [Source.open(folder) for folder in self.recordings]
+        return recordings_document(opened, list(map(digests, self.recordings)))
 
 
 def _falls(before: Run, after: Run, share: float) -> bool:

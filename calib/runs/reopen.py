@@ -63,18 +63,6 @@ def effects_of_prior(folder: Path | str | None) -> Sequence[Effect]:
     return found
 
 
-def known_before(run: Run | None) -> dict[Path, list[Source]]:
-    """A run and all that stood for CAD below it, each with its recordings, without what it left
-    out; none of a run of which any is gone."""
-    out: dict[Path, list[Source]] = {}
-    while run is not None and run.folder not in out:
-        folders = [remote.here(folder) for folder in run.recordings]
-        there = all(folder.is_dir() for folder in folders)
-        out[run.folder] = leave_out([*map(Source.open, folders)], run.left_out) if there else []
-        run = Run.open(run.prior) if run.prior and run.prior.is_dir() else None
-    return out
-
-
 def effects_that_may_run(run: Run) -> tuple[list[Effect], str]:
     """Effects of a run's model but those of Python files that the user did not say may run, and
     the sentence that says which these are; empty where there is none."""

@@ -148,7 +148,7 @@ class Run:
     def doubts(self) -> list[str]:
         """Why the fit may not be what it should be, a sentence each."""
         out = [] if self.converged else [NOT_CONVERGED]
-        out += self.summary.get("prior_found_wrong", ())
+        out += self.prior_found_wrong
         if self.set_aside:
             out.append(f"Set aside, as they contradict everything else: {self.listed_aside}.")
         return out
@@ -159,13 +159,33 @@ class Run:
         return [*self.doubts, *self.omissions, *self.extrapolated]
 
     @property
+    def prior_found_wrong(self) -> list[str]:
+        """What speaks against the run that was its prior, and against its own; sentences."""
+        return list(self.summary.get("prior_found_wrong", ()))
+
+    @property
     def found_wrong(self) -> list[str]:
         """What its diagnosis found that speaks against its numbers as they are, as a sentence; none
-        where it found nothing of the kind, or was not asked."""
-        found = self.diagnosis() or {"verdict": ""}
+        where it found nothing of the kind, or there is none that can be read."""
+        try:
+            found = self.diagnosis() or {"verdict": ""}
+        except InputError:
+            return []
         if found["verdict"] not in FOUND_WRONG:
             return []
-        return [f"{self.folder}: {FOUND_WRONG[found['verdict']]}: {found['sentences'][0]}"]
+        return [f"{self.folder}: {FOUND_WRONG[found['verdict']]}: {self.finding(found)}"]
+
+    def finding(self, diagnosis: Mapping[str, Any]) -> str:
+        """The first sentence of a diagnosis, but for those that stand above all that is shown."""
+        sentences, above = diagnosis["sentences"], self.warning
+        return next((each for each in sentences if each not in above), sentences[0])
+
+    @property
+    def rests_on(self) -> list[str]:
+        """Digests of all measurements that its estimate rests on, those of its prior included; see
+        `calib.recalibration.twice`. None of a run of an earlier version."""
+        found = read_arrays(self.folder / COVARIANCE).get("rests_on", np.zeros(0, "S64"))
+        return [each.decode() for each in found.tolist()]
 
     @property
     def before_use(self) -> list[str]:

@@ -27,7 +27,8 @@ def blunder_cells(blunder: Mapping[str, Any]) -> tuple[str, str, str]:
         said.append(f"it was taken at {blunder['belongs_to']}")
     if blunder["wrong_sign"]:
         said.append(f"its {blunder['wrong_sign']} may have the wrong sign")
-    size = size_told(blunder["size"], blunder["sigma"], blunder["unit"])
+    known = blunder["size"] is not None
+    size = size_told(blunder["size"], blunder["sigma"], blunder["unit"]) if known else ""
     what = blunder["without"] or f"{blunder['kind']} of {blunder['name']}"
     return what, f"{size} {along}".rstrip(), "; ".join(said)
 

@@ -45,16 +45,10 @@ def judge(run: Run, diagnosis: Mapping[str, Any] | None) -> Verdict:
     """
     red, amber = list(_wrong(run, diagnosis)), list(_doubtful(run, diagnosis))
     light = "red" if red else "amber" if amber else "green"
-    sentence = _first_found(run, diagnosis) if diagnosis else _undiagnosed(run)
+    sentence = run.finding(diagnosis) if diagnosis else _undiagnosed(run)
     sentence = sentence if run.converged else run.warning[0]
     fine = "no effect is missing, and stops that it never saw are predicted as well as noise allows"
     return Verdict(light, sentence, tuple(red + amber) or (fine,))
-
-
-def _first_found(run: Run, diagnosis: Mapping[str, Any]) -> str:
-    """The first sentence of a diagnosis, but for those that stand above all that is shown."""
-    sentences = diagnosis["sentences"]
-    return next((each for each in sentences if each not in run.warning), sentences[0])
 
 
 def _undiagnosed(run: Run) -> str:

@@ -233,7 +233,7 @@ def test_a_copy_of_a_recording_is_refused(rec, refused):
     """As data it counts once, wherever it is."""
     shutil.copytree(rec, rec.parent / "copy")
     sentence = refused("fit", rec, rec.parent / "copy", "-o", rec.parent / "run")
-    assert "rec and " in sentence and "copy hold the same" in sentence
+    assert "rec and " in sentence and "copy hold the same measurements" in sentence
 
 
 def test_scans_that_two_recordings_hold_are_refused(rec, refused):
@@ -243,7 +243,7 @@ def test_scans_that_two_recordings_hold_are_refused(rec, refused):
     digits = re.sub(r"(\d\.\d{6})\d+", r"\1", "\n".join(lines[:-1]))
     (copy / "stops.csv").write_text(digits)
     sentence = refused("fit", copy, rec, "-o", rec.parent / "run")
-    assert "hold the same: scans or rows of " in sentence and "count once" in sentence
+    assert "hold the same measurements: L00P00, L0" in sentence and "count once" in sentence
 
 
 def test_another_lidar_under_the_same_name_is_refused(rec, refused):
@@ -256,7 +256,9 @@ def test_another_lidar_under_the_same_name_is_refused(rec, refused):
     assert model != "ouster_os0_128_rev6"
     (other / "rig.yaml").write_text(text.replace(f"model: {model}", "model: ouster_os0_128_rev6"))
     sentence = refused("fit", rec, other, "-o", rec.parent / "run")
-    assert "ring_range_offset has 128 parameters here and" in sentence
+    assert (
+        "ring_range_offset has other parameters here than in" in sentence and "ring_0" in sentence
+    )
     assert "call this rig otherwise in rig.yaml" in sentence
 
 

@@ -84,4 +84,4 @@ def test_a_recording_that_fits_nothing_by_itself_is_named(home, tmp_path):
     assert not run.converged
     (bad,) = diagnose(run).blunders
     assert (bad["kind"], bad["recording"]) == ("recording", "after")
-    assert bad["sentence"].startswith("What is wrong is in after: a fit to it alone comes to no")
+    assert bad["sentence"].startswith("A fit to after alone comes to no optimum, and one to before")

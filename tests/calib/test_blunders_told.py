@@ -8,6 +8,7 @@ import pytest
 from calib.blunders import judged, told
 from calib.blunders.shifts import Shift
 from calib.residuals.groups import CAD, Group
+from calib.show.blunders import blunder_cells
 
 
 def far_out(shift):
@@ -22,6 +23,10 @@ def far_out(shift):
         detectable={},
         looks=10,
     )
+
+
+def test_a_recording_that_fits_nothing_has_no_size_in_tables():
+    assert blunder_cells(told.of_recording("after", "before")) == ("recording of after", "", "")
 
 
 @pytest.mark.parametrize(("turn", "possible"), [(3.13, True), (3.15, True), (4.0, False)])

@@ -14,14 +14,16 @@ def made(**changes):
     return FormulaEffect.read(DAMP | changes, "mine.yaml", {})
 
 
-@pytest.mark.parametrize("unit", ["mm", "mm/K", "deg", "m * mrad", "°", "1/cm", "m µm"])
+@pytest.mark.parametrize(
+    "unit", ["mm", "mm/K", "deg", "m * mrad", "°", "1/cm", "m \u00b5m", "\u03bcm"]
+)
 def test_units_that_numbers_do_not_have_are_refused(unit):
     """They would be printed beside numbers in m and rad."""
     with pytest.raises(InputError, match=r"take and give m and rad.*write (m|rad) in place of"):
         made(unit=unit)
 
 
-@pytest.mark.parametrize("unit", ["1", "m", "m/K", "rad/(N m)", "rad/h", "1/m**2", "kg m"])
+@pytest.mark.parametrize("unit", ["1", "m", "m/K", "rad/(N m)", "rad/h", "1/m**2", "kg m", "m/°C"])
 def test_units_of_si_are_taken(unit):
     assert made(unit=unit).unit == unit
 

@@ -180,7 +180,7 @@ def link_of_rings(shift, seed):
 def test_what_all_rings_have_changed_by_is_found_among_many():
     """Of 64 rings a common change of 1.5 sigmas is little for each; it is 8.5 of their mean's."""
     links = [link_of_rings(np.full(64, 1.5), seed) for seed in range(20)]
-    assert all(link.moved and link.as_one for link in links)
+    assert all(link.moved and link.of_mean for link in links)
     z = [(link.of_mean[0] - 1.5) / link.of_mean[1] for link in links]
     assert abs(np.mean(z)) < 3 / np.sqrt(20) and 0.6 < np.std(z) < 1.4
     assert links[0].of_mean[1] == pytest.approx(np.sqrt(2 / 64), rel=1e-3)
@@ -188,8 +188,14 @@ def test_what_all_rings_have_changed_by_is_found_among_many():
 
 def test_a_ring_that_changed_by_itself_is_told_by_itself():
     link = link_of_rings(12.0 * np.eye(64)[5], 1)
-    assert link.moved and not link.as_one
+    assert link.moved and not link.of_mean
     assert np.argmax(np.abs(link.change) / link.sigma) == 5
+
+
+def test_half_of_the_rings_are_not_all():
+    """Though their mean has changed as well."""
+    links = [link_of_rings(np.repeat([3.0, 0.0], 32), seed) for seed in range(5)]
+    assert all(link.moved and not link.of_mean for link in links)
 
 
 def test_two_looks_at_rings_alarm_no_more_often_than_one():
@@ -330,9 +336,9 @@ def test_what_a_run_knows_is_no_news_to_a_fit_from_it(runs, tmp_path):
     part = shutil.copytree(home / "before", tmp_path / "part")
     keep(part, ("L00",))
     for recording, run in (("before", "a"), ("after", "from_a"), ("before", "from_a")):
-        with pytest.raises(InputError, match=r"--prior: .*was fitted to L0.*data count once"):
+        with pytest.raises(InputError, match=r"--prior .*rests on L0.*data count once"):
             calibrate(home / recording, tmp_path / "run", prior=home / run)
-    with pytest.raises(InputError, match="was fitted to L00P00, L00P01, L00P02 of"):
+    with pytest.raises(InputError, match="rests on L00P00, L00P01, L00P02 of"):
         calibrate(part, tmp_path / "run", prior=home / "a")
 
 

@@ -1,6 +1,7 @@
 """A run that has not converged, or lacks what was left out, says so wherever it is shown."""
 
 import json
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import pytest
@@ -105,6 +106,11 @@ def test_what_a_diagnosis_found_wrong_is_told_by_all_that_takes_numbers(less, ri
         for name in ("extrinsics.yaml", "rig.urdf"):
             text = " ".join((less / "files" / name).read_text().replace("#", "").split())
             assert (told in text) == wrong, name
+
+
+def test_what_a_diagnosis_found_is_not_what_stands_above_it():
+    found = {"sentences": ["Left out: s1:scan", "X is missing."]}
+    assert Run.finding(SimpleNamespace(warning=["Left out: s1:scan"]), found) == "X is missing."
 
 
 def test_the_solution_says_it_to_whoever_reads_only_that(loose, less):

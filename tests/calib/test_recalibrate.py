@@ -89,6 +89,7 @@ def world(monkeypatch):
                 values=values(x),
                 covariance=covariance,
                 information=information,
+                converged=True,
             )
 
         monkeypatch.setattr(refit, "solve", solve)

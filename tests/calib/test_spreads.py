@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import optimize, stats
+from scipy.linalg import block_diag
 
 from calib.diagnosis.chance.at_zero import AtZero
 from calib.solve.components.told import Told
@@ -101,11 +102,16 @@ def test_what_members_have_in_common_is_no_spread():
     information = np.linalg.inv(V)
     told = Told(information @ (own + mean), information, np.zeros(4, int))
     expected = np.sqrt(own.var(ddof=1) - sigma**2)
-    about = told.about_mean()
+    about = told.about_means([slice(0, 4)])
     assert about.spread(np.full(1, 3e-4))[0] == pytest.approx(expected, rel=1e-4)
-    again = Told(information @ (own - mean), information, told.group).about_mean()
+    again = Told(information @ (own - mean), information, told.group).about_means([slice(0, 4)])
     np.testing.assert_allclose(again.score, about.score, atol=1e-6 * np.abs(about.score).max())
     assert told.spread(np.full(1, 3e-4))[0] > 2 * expected
+    np.testing.assert_array_equal(told.about_means([slice(0, 1)]).information, information)
+    both = block_diag(information, information)  # two LiDARs, whose zeros are far apart
+    rows = np.concatenate([information @ (own + mean), information @ (own - mean)])
+    apart = Told(rows, both, np.zeros(8, int)).about_means([slice(0, 4), slice(4, 8)])
+    assert apart.spread(np.full(1, 3e-4))[0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_values_as_fitted_say_the_same_whatever_held_them():

@@ -214,7 +214,7 @@ class Chance:
 def chances(
     scores: Scores,
     some: Sequence[Scatter],
-    columns: Mapping[str, np.ndarray],
+    columns: Mapping[str, Sequence[np.ndarray]],
     noisier: float = 1.0,
 ) -> list[Chance]:
     """The tests of effects whose values are drawn by chance.
@@ -222,15 +222,17 @@ def chances(
     Args:
         scores: of candidates, these among them.
         some: those to test.
-        columns: effect's name -> its columns among the scores.
+        columns: effect's name -> its columns among the scores, of each of its unknowns.
         noisier: how many times wider than their sigmas the rows scatter by themselves.
     """
     found = []
     for effect in some:
-        at = columns[effect.name]
+        mine = columns[effect.name]
+        at = np.concatenate(mine)
         score, information = scores.score[at], scores.information[np.ix_(at, at)]
         rows = Told(score, information, np.zeros(len(at), int))
-        rows = rows.about_mean().of_noisier(noisier)
+        ends = np.cumsum([0, *map(len, mine)]).tolist()
+        rows = rows.about_means(map(slice, ends, ends[1:])).of_noisier(noisier)
         found.append(_of_values(effect, rows))
     return [chance for chance in found if chance is not None]
 

@@ -68,7 +68,7 @@ def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> 
             steps[effect.name] = [ShapeStep(effect, theta, to=shape) for shape in others]
     if not steps:
         return {}
-    linear, at = stand.linearise([step for some in steps.values() for step in some], progress)
+    linear, at, _ = stand.linearise([step for some in steps.values() for step in some], progress)
     scores, swapped = project(linear, linear.candidates), {}
     for name, some in steps.items():
         effect = some[0].effect

@@ -123,7 +123,7 @@ def _likeness(
 ) -> dict[str, float]:
     """Candidate -> the share of what formulas of the model do that it can do in their place, in
     squared sigmas, all that the rest of the model absorbs taken off."""
-    linear, at = stand.linearise(candidates, progress)
+    linear, at, _ = stand.linearise(candidates, progress)
     own = variables_of(stand.problem, {e.name for e in formulas})
     drawn = [name for names in own.values() for name in names]
     information = information_left(linear, [*drawn, *linear.candidates])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -28,8 +29,9 @@ SITE_WORDS = {
 TRACKER = "tracker:"  # before a body's name, as frames go by the same
 Text = Annotated[str, pydantic.Field(min_length=1)]
 # What stands in place of units that numbers of formulas do not have.
-SI = dict.fromkeys(("nm", "um", "µm", "mm", "cm", "km", "inch", "ft"), "m")
-SI |= dict.fromkeys(("deg", "degree", "degrees", "°", "mrad", "urad", "µrad", "arcsec"), "rad")
+SI = dict.fromkeys(("nm", "um", "\u03bcm", "mm", "cm", "km", "inch", "ft", "millimetre"), "m")
+SI |= dict.fromkeys(("deg", "degree", "degrees", "°", "mrad", "urad", "\u03bcrad", "mas"), "rad")
+SI |= dict.fromkeys(("arcsec", "arcmin"), "rad")
 LARGEST_VALUE = 1e100  # of a formula: the squares of larger ones overflow
 Sigma = Annotated[Number, pydantic.Field(gt=0)]
 
@@ -75,7 +77,7 @@ class FormulaFile(Document):
     @pydantic.field_validator("unit")
     @classmethod
     def _of_si(cls, unit: str) -> str:
-        for part in re.findall(r"[^\W\d_]+|°", unit):
+        for part in re.findall(r"[^\W\d_]+|°(?!C)", unicodedata.normalize("NFKC", unit)):
             if part in SI:
                 raise ValueError(
                     f"{unit}: formulas take and give m and rad, so parameters and sigma are in "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -45,9 +45,16 @@ class Told:
         score = (scaled @ (values / root)) / root
         return cls(score, (information + information.T) / 2, group)
 
-    def about_mean(self, which: slice = slice(None)) -> Told:
-        """The same of how far some values are from their mean, of which nothing is known: that
-        belongs to what they have in common, as a range zero, however little its prior allows."""
+    def about_means(self, of_each: Iterable[slice]) -> Told:
+        """The same of how far some values, those of each unknown, are from their mean, of which
+        nothing is known: that belongs to what they have in common, as the range zero of a LiDAR,
+        however little its prior allows. A single value has no mean beside itself."""
+        out = self
+        for which in of_each:
+            out = out._about_mean(which) if which.stop - which.start > 1 else out
+        return out
+
+    def _about_mean(self, which: slice) -> Told:
         of_mean = self.information[:, which].sum(axis=1)
         seen = float(of_mean[which].sum())
         if seen <= DIRECTION_SEEN * float(np.trace(self.information)):
@@ -221,11 +228,9 @@ def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: 
         np.square(np.concatenate([u.sigma for u in some])),
         groups(some),
     )
-    end = 0
-    for unknown in some:
-        start, end = end, end + unknown.dim
-        out = out.about_mean(slice(start, end)) if len(spread_keys(unknown)) == 1 else out
-    return out
+    ends = np.cumsum([0, *(u.dim for u in some)]).tolist()
+    pairs = zip(some, map(slice, ends, ends[1:]), strict=False)
+    return out.about_means(which for u, which in pairs if len(spread_keys(u)) == 1)
 
 
 def groups(some: Sequence[Unknown]) -> np.ndarray:
