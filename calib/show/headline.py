@@ -13,12 +13,14 @@ from calib.runs.run import Run
 from calib.show.misfit import and_angle, over_beams
 from calib.show.verdict import UNASKED, judge
 
+ALL_MOVED = 4  # links, none of which stayed: a choice; a knock moves one or two
 TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went is named
 
 
 class Words(NamedTuple):
     """How a change is told: of a length, of an angle, of an effect; that there is no other, that
-    there is none at all, that nothing is known; and what stands above links with and without."""
+    there is none at all, that nothing is known; what stands above links with and without; and what
+    is asked where everything changed."""
 
     shifted: str
     turned: str
@@ -28,6 +30,7 @@ class Words(NamedTuple):
     silent: str
     title: str
     title_of_none: str
+    all_of_them: str = ""
 
 
 MOVED_WORDS = Words(
@@ -36,6 +39,7 @@ MOVED_WORDS = Words(
     silent="the new data do not determine {}",
     title="moved since the earlier run",
     title_of_none="not moved",
+    all_of_them="nothing that the new data tell of stayed as it was: is it the same rig?",
 )
 DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwise
     *("differs by", "differs by", "differs by", "no other estimate differs significantly"),
@@ -61,7 +65,10 @@ def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORD
             f"{link['name']} {' and '.join(_changes(link, words))}{_in_its_place(link)}"
             for link in moved
         )
-        out += f"; {words.no_other}" if still else ""
+        if still:
+            out += f"; {words.no_other}"
+        elif words.all_of_them and len(moved) >= ALL_MOVED:
+            return f"{out}; {words.all_of_them}"
     else:
         out = words.none
     if silent:

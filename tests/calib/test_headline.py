@@ -94,6 +94,14 @@ def test_what_the_new_data_do_not_show_is_not_said_to_stand_still():
     assert moved_sentence([LIDAR, silent]).endswith("the new data do not determine mount.")
 
 
+def test_where_everything_moved_it_is_asked_whether_it_is_the_same_rig():
+    every = [{**LIDAR, "name": name} for name in ("base", "arm", "mount", "lidar")]
+    assert moved_sentence(every).endswith("stayed as it was: is it the same rig?")
+    still = link("faro", False, [0] * 6, [1e-4] * 6)
+    assert "same rig" not in moved_sentence([*every, still])
+    assert "same rig" not in moved_sentence(every[:2])
+
+
 def test_the_workbench_says_what_moved():
     assert "Since the earlier run: lidar moved +2.94" in panels.moved(fitted(links=[LIDAR]))
     assert panels.moved(fitted()) == ""
