@@ -147,7 +147,7 @@ def test_the_page_about_ones_own_effects_shows_what_is_printed(tmp_path):
     assert len(places) == 9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "part", [(3, 6), pytest.param(None, marks=pytest.mark.long)], ids=["in part", "whole"]
 )
@@ -187,6 +187,7 @@ def test_the_page_about_same_bytes_shows_what_is_printed(tmp_path):
     assert set(keys) == set(Run.open(tmp_path / "grown").model)
 
 
+@pytest.mark.long
 def test_the_page_about_large_recordings_shows_what_is_printed(tmp_path):
     page = run_through(ROOT / "docs/scale.md", tmp_path)
     (shown,) = (block for block in blocks("text", page.text) if "identical" in block)
@@ -211,7 +212,7 @@ def test_the_page_about_chance_shows_what_is_printed(tmp_path):
     assert f"{1e3 * sigma.mean():.2f} mm" in session.text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_about_plans_shows_what_is_printed(tmp_path):
     session = run_through(ROOT / "docs/plan.md", tmp_path)
     shown = blocks("text", session.text)

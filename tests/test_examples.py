@@ -78,7 +78,7 @@ def test_the_missing_effect_is_found_and_sized(tmp_path):
     assert said.splitlines()[-1].startswith("The model is adequate")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ones_own_effect_is_found_as_a_formula_and_as_a_class(tmp_path):
     said = example(5, tmp_path)
     before, *after = map(float, re.findall(r"(\S+) mm held out", said))
@@ -106,7 +106,7 @@ def of_a_ur10(folder, data, diagnosed="D"):
         (folder / "said.txt").write_text(example(6, folder, data), encoding="utf-8")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("diagnosed", ["D", pytest.param("AD", marks=pytest.mark.long)])
 def test_a_ur10_lacks_what_its_example_says(once, shared, diagnosed):
     """Of series A the errors are of its table, and its diagnosis takes as long as all of that."""
@@ -123,7 +123,7 @@ def test_a_ur10_lacks_what_its_example_says(once, shared, diagnosed):
     np.testing.assert_allclose(ur10_table()[:3], found[[0, 1, 3]], rtol=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_report_says_red_before_and_green_after(tmp_path):
     said = example(7, tmp_path)
     assert re.search(r"^first.html: red, incidence_angle_bias is missing", said, flags=re.M)

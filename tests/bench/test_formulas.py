@@ -275,7 +275,7 @@ def test_the_table_counts():
     assert " 00x1" not in said and "FAILED: 03x1: ValueError: no" in said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "most"), [("arm", 0), ("head", 1), pytest.param("planes", 0, marks=pytest.mark.long)]
 )

@@ -41,7 +41,7 @@ def test_nothing_is_found_where_nothing_is_hidden(number):
     assert result["untestable"]["range_offset"].startswith("not identifiable")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "effect", [*SHOWN, *(pytest.param(e, marks=pytest.mark.long) for e in SHOWN_TOO)]
 )

@@ -154,7 +154,7 @@ def off_by(estimate, source, world, joints):
     return np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.long if n in LIKE_ANOTHER else ()) for n in TABLES]
 )

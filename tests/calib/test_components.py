@@ -129,7 +129,7 @@ WAYS = {  # a tracker that scatters is told further below
 QUICK = ("target_scatter",)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.long) for n in WAYS]
 )

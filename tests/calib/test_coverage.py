@@ -16,7 +16,7 @@ from chains import se3
 
 from ..once import Once
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 FEW = 8  # sigmas of links a fifth too small, or of rings three tenths, fail with so few
 RIGS = int(os.environ.get("RIGCAL_COVERAGE_RIGS", "24"))
 

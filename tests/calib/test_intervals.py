@@ -92,6 +92,7 @@ def test_the_formula_is_that_of_the_module():
         pytest.param(24, 6, 1.0, 0.91, 0.97, marks=pytest.mark.long),
     ],
 )
+@pytest.mark.long
 def test_intervals_hold_the_truth_where_stops_err_together(
     stops, parameters, together, least, most
 ):

@@ -82,7 +82,7 @@ def test_scores_scatter_as_far_as_clusters_say(tmp_path):
         (tmp_path / str(seed)).mkdir()
         stand = fitted(arm(tmp_path / str(seed), seed))
         names = ("arm_joint_eccentricity", "arm_joint_scale", "optitrack_distortion")
-        linear, at = stand.linearise([find(name) for name in names], quiet)
+        linear, at, _ = stand.linearise([find(name) for name in names], quiet)
         scores = project(linear, linear.candidates, stand.spent)
         for columns in at.values():
             test = score_test(scores, columns)
@@ -92,7 +92,7 @@ def test_scores_scatter_as_far_as_clusters_say(tmp_path):
 
 def test_the_score_itself_is_that_of_residuals_as_they_are(tmp_path):
     stand = fitted(arm(tmp_path, 3))
-    linear, at = stand.linearise([find("arm_joint_scale")], quiet)
+    linear, at, _ = stand.linearise([find("arm_joint_scale")], quiet)
     scores = project(linear, linear.candidates, stand.spent)
     test = score_test(scores, at["arm_joint_scale"])
     grown = stand.with_effects([find("arm_joint_scale")], quiet)

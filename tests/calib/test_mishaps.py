@@ -137,7 +137,7 @@ def test_where_nothing_was_done_nothing_is_named(tmp_path, seed):
     assert searched(tmp_path / "rec").blunders == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "blunder", "effect"),
     [

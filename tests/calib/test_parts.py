@@ -71,7 +71,7 @@ def test_a_shape_between_those_of_the_grid_is_told_as_well(look, joint):
     """Once it is found its information is that of its own shape, and its score that of its test."""
     effect = next(e for e in CATALOGUE if e.name == "arm_gear_error").at(28)
     stand = look.stand
-    linear, at = stand.linearise([effect], lambda what, done, total: None)
+    linear, at, _ = stand.linearise([effect], lambda what, done, total: None)
     own = project(linear, linear.candidates, stand.spent)
     theta = np.zeros(12)
     theta[2 * joint : 2 * joint + 2] = 0.001

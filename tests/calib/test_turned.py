@@ -87,10 +87,8 @@ def test_a_lidar_that_is_elsewhere_is_not_turned(good, tmp_path):
     assert lidars_turned(problem, problem.initial) == {}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "degrees", [TURNS[-1], pytest.param(QUARTERS[1], marks=pytest.mark.long)], ids=str
-)
+@pytest.mark.long
+@pytest.mark.parametrize("degrees", [TURNS[-1], QUARTERS[1]], ids=str)
 def test_the_fit_and_its_diagnosis_are_those_of_the_right_rig(good, tmp_path, degrees):
     """With the CAD of the LiDAR left out, from either rig.yaml the same place of the LiDAR on its
     mount; as it stands the diagnosis names that CAD, and `check` has said what it should be."""

@@ -11,7 +11,7 @@ from sensors.readers.meshes.survey import read_blocks, read_survey
 
 PUMP = Path(__file__).parents[3] / "shared/data/reference/e57_pump/pumpAVisualReferenceImage.e57"
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.long,
     pytest.mark.skipif(not PUMP.exists(), reason="the shared data are not beside the checkout"),
 ]
 

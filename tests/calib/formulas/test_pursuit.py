@@ -182,6 +182,7 @@ def kinds(formula):
         ),
     ],
 )
+@pytest.mark.long
 def test_the_form_is_that_which_was_planted(found, name, expected):
     _, _, (formula,) = found(name)
     assert set(kinds(formula)) == expected
