@@ -221,7 +221,7 @@ class _Choices:
     def data(self, sources: Sequence[Source], contents: Sequence[remote.Digests]) -> list[str]:
         """Digests of all that the estimate rests on; see `all_once`."""
         known = self.before.rests_on if self.before else []
-        return all_once(sources, [each.each for each in contents], known, self.prior)
+        return all_once(sources, [found.each for found in contents], known, self.prior)
 
 
 def _fit(

@@ -276,7 +276,7 @@ class _Climb:
     def _told(self) -> list[dict[str, str]]:
         """The recordings as a run's model.yaml has them."""
         opened = [Source.open(folder) for folder in self.recordings]
-        return recordings_document(opened, list(map(digests, self.recordings)))
+        return recordings_document(opened, [digests(s.recording.folder) for s in opened])
 
 
 def _falls(before: Run, after: Run, share: float) -> bool:

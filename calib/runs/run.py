@@ -46,10 +46,10 @@ _OF_CANDIDATE |= {"unabsorbed_rms_mm"}
 _OF_CURVE = {"covariates", "centres", "mean_mm", "band_mm"}
 RING_NAME = re.compile(r"ring_(\d+)")  # a parameter of a ring
 _OF_STATE, _OF_MET = "state/", "met/"  # before every name in that file: numpy reserves a few
-FOUND_WRONG = {
+FOUND_WRONG = {  # verdicts by which numbers are not to be used as they are
     "missing_effect": "its diagnosis says that the model lacks an effect",
     "bad_data": "its diagnosis says that something in the recording is wrong",
-}  # verdicts by which numbers are not to be used as they are
+}
 NOT_CONVERGED = "NOT CONVERGED: the fit did not end at an optimum; its numbers are not to be used"
 
 
@@ -173,7 +173,7 @@ class Run:
             return []
         if found["verdict"] not in FOUND_WRONG:
             return []
-        return [f"{self.folder}: {FOUND_WRONG[found['verdict']]}: {self.finding(found)}"]
+        return [f"{self.folder.name}: {FOUND_WRONG[found['verdict']]}: {self.finding(found)}"]
 
     def finding(self, diagnosis: Mapping[str, Any]) -> str:
         """The first sentence of a diagnosis, but for those that stand above all that is shown."""
