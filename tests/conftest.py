@@ -24,11 +24,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, lambda *_: None)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-# Heaviest first, by seconds of a core (90 to 11), browsers too: the last files should be short.
+# Heaviest first, by seconds of a core (150 to 11), browsers too: the last files should be short.
 HEAVY = [
     "test_damage",
     "test_docs",
     "test_examples",
+    "test_report",
+    "test_search",
+    "test_executors",
+    "test_diagnoses",
+    "test_cli",
     "test_components",
     "test_view_browser",
     "test_same_bytes",
