@@ -97,10 +97,13 @@ def _read_pcd(path: Path) -> Columns:
     with _quiet():
         try:
             cloud = o3d.t.io.read_point_cloud(str(path), format="pcd")
+            fields = list(cloud.point.items())
         except RuntimeError as error:
             raise InputError(f"{path} is a broken PCD file: {_sentence(error)}") from None
+        except UnicodeDecodeError:
+            raise InputError(f"{path} is a broken PCD file: a field has no name") from None
     columns: Columns = {}
-    for name, tensor in cloud.point.items():
+    for name, tensor in fields:
         values = tensor.numpy()
         names = _GROUPS.get(name, (name,))
         columns |= {n: np.ascontiguousarray(values[:, i]) for i, n in enumerate(names)}

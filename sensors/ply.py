@@ -131,6 +131,10 @@ def _read_header(path: Path) -> tuple[str, list[_Element], int]:
             order = _read_line(line.split(), elements) or order
         except (KeyError, ValueError, IndexError):
             raise InputError(f"{path}: `{line.strip()}` is no line of a PLY header") from None
+    for element in elements:
+        names = [name for name, _, _ in element.properties]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"{path}: its element {element.name} has {twice[0]} twice")
     if order is None:
         raise InputError(f"{path}: its header has no line `format`, as every PLY file does")
     return order, elements, end.end()

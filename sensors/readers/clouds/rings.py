@@ -142,7 +142,10 @@ def _rings(
         return f"field {fields['ring']}, from {first}", first, None, rows
     if rows:
         return "the rows of the cloud", 0, None, True
-    groups = elevation_groups(xyz_m, options.lidar) or ring_order(xyz_m)
+    try:
+        groups = elevation_groups(xyz_m, options.lidar) or ring_order(xyz_m)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
     if groups is None:
         raise InputError(
             f"{name} has no field for the ring (its fields are {', '.join(cloud.fields)}), and its"
