@@ -155,7 +155,9 @@ class RigDocument(Document):
     name: Annotated[str, pydantic.AfterValidator(_file_name)]
     lidar: LidarDocument | None = None
     arm: ArmDocument | None = None
-    frames: dict[str, FrameDocument] = pydantic.Field(default_factory=dict)
+    frames: dict[Annotated[str, pydantic.Field(min_length=1)], FrameDocument] = pydantic.Field(
+        default_factory=dict
+    )
     base: BaseDocument = BaseDocument()
     tracker: TrackerDocument | None = None
     levels: LevelsDocument | None = None

@@ -34,7 +34,10 @@ class Words(NamedTuple):
 
 
 MOVED_WORDS = Words(
-    *("moved", "turned", "changed by", "nothing else moved"),
+    shifted="moved",
+    turned="turned",
+    changed="changed by",
+    no_other="nothing else moved",
     none="nothing moved significantly",
     silent="the new data do not determine {}",
     title="moved since the earlier run",
@@ -42,7 +45,10 @@ MOVED_WORDS = Words(
     all_of_them="nothing that the new data tell of stayed as it was: is it the same rig?",
 )
 DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwise
-    *("differs by", "differs by", "differs by", "no other estimate differs significantly"),
+    shifted="differs by",
+    turned="differs by",
+    changed="differs by",
+    no_other="no other estimate differs significantly",
     none="no estimate differs significantly",
     silent="{} is not known",
     title="differs significantly",

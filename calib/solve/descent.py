@@ -128,19 +128,21 @@ class Pass:
         return self._weighed
 
     def step(self, outer: Sequence[str]) -> tuple[dict[str, np.ndarray], float]:
-        """One step of the graph, whose unknowns are `outer`, as of `Descent.step`."""
+        """One step of the graph, as of `Descent.step`.
+
+        Args:
+            outer: the unknowns that are in the graph.
+        """
 
         def compute() -> Answer:
             linear, graph = self.whole
             _, moved, fall = graph.step(self.values)
             kept = np.concatenate([np.zeros(0), *(moved[n] for n in outer)])
             fall += (linear.chi2 - linear.kept[-1, -1]) / 2
-            steps = {**moved, **linear.step(kept)}.items()  # an unknown may be called anything
-            return {"fall": np.float64(fall)} | {f"step {name}": x for name, x in steps}
+            return {"": np.float64(fall), **moved, **linear.step(kept)}
 
         found = dict(self._answer({}, compute))
-        fall = float(found.pop("fall"))
-        return {name.removeprefix("step "): x for name, x in found.items()}, fall
+        return {name: x for name, x in found.items() if name}, float(found[""])
 
 
 class Descent:
