@@ -125,7 +125,7 @@ def test_the_page_about_trust_runs(tmp_path):
     assert (tmp_path / "run" / "evaluation.json").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_about_ones_own_effects_shows_what_is_printed(tmp_path):
     session = run_through(ROOT / "docs/your_own_effects.md", tmp_path)
     shown = blocks("text", session.text)

@@ -114,7 +114,7 @@ def test_files_are_the_same_byte_by_byte(made):
     assert [name for name in one if one[name] != other[name]] == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_file_says_where_it_lies(made):
     """Or two folders would differ by it; recordings are told by their path, as they are given."""
     for folder in made:
@@ -128,7 +128,7 @@ def test_every_command_is_among_them():
     assert tried | SERVING == names
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_made_again_is_identical(made):
     said = (next(folder.glob("saying-*-reproduce.txt")) for folder in made)
     documents = [json.loads(path.read_text()) for path in said]

@@ -174,7 +174,7 @@ def test_the_report_opens_no_dialog_runs_its_own_script_alone_and_loads_nothing(
         assert watched.page.evaluate(colour) == "8px"  # the page's own style is let in
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_gets_into_the_page_all_the_same_does_nothing(page, tmp_path):
     """As if an escape were forgotten: the policy stands behind them."""
     with _server() as server, browser_page() as watched:

@@ -102,6 +102,7 @@ def test_what_is_told_has_its_unit(page, folder, name, part):
     assert all(" mm" in each or " mrad" in each for each in told[:1])
 
 
+@pytest.mark.long
 def test_a_point_is_told_as_its_row_and_nothing_where_there_is_none(page):
     rows = numbers(page, "rings")
     assert rows[0][1:3] == ["ring", "ring_range_offset, mm"]

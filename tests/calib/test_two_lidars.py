@@ -45,6 +45,7 @@ def test_each_lidar_has_its_own_curve_of_every_covariate(found):
         assert curve.document()["rig"] == curve.rig
 
 
+@pytest.mark.long
 def test_the_error_is_in_the_curve_of_the_lidar_that_has_it(found):
     """4.9 mm rms of its ranges, of which the model takes on a quarter."""
     rms_mm = {
