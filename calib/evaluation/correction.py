@@ -33,8 +33,8 @@ KnownOfBeams = Callable[
 ]  # beams of points -> what else is known of them
 NEIGHBOURS = 24, 12  # of a point, through which its plane is laid; nearer ones where that is none
 SUPPORT = 200_000  # points among which neighbours are sought
-# How thick a plane may be: so many sigmas of the range, and so much of its width, which turns a
-# normal by 0.05 rad. A choice: the walls of a real room bulge by some 5 mm over a metre.
+# How thick a plane may be: so many sigmas of the range, and so much of its width. A choice: what is
+# as thick turns a normal by 0.05 rad.
 THICKEST_SIGMAS, THICKEST = 3.0, 0.05
 # Of a normal, by the noise of its neighbours, which tell it less the nearer they are to one line. A
 # choice: at 60 degrees 1 / cos is then known to a fifth.

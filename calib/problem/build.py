@@ -91,6 +91,8 @@ def _refuse_other_cad(sources: Sequence[Source]) -> None:
     first: dict[str, Source] = {}
     for source in sources:
         other = first.setdefault(source.rig.name, source)
+        if other is source:
+            continue
         mine, theirs = (
             dict(zip(rig.tree.edge_names, rig.tree.edges, strict=True))
             for rig in (source.rig, other.rig)

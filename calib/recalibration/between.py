@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,13 @@ from calib.results.solution import Solution, solution_of
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
-NO_OPTIMUM = "no optimum"  # in place of a solution
+
+class _Alone(NamedTuple):
+    """What one recording alone knows; None where its fit comes to no optimum, or where it `can_fit`
+    nothing: it has nothing to start from, or lacks what an effect needs."""
+
+    known: Solution | None
+    can_fit: bool
 
 
 def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dict[str, Any]]:
@@ -49,11 +55,13 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
             continue
         ask = mine[:1] if stand.estimate.converged else mine
         alone = {label: _alone(model, named[label], progress) for label in ask}
-        first = next((label for label, known in alone.items() if isinstance(known, Solution)), None)
-        bad = [label for label, known in alone.items() if known is NO_OPTIMUM] if first else []
+        first = next((label for label, each in alone.items() if each.known), None)
+        if first is None:
+            continue
+        bad = [label for label, each in alone.items() if each.can_fit and not each.known]
         yield from (told.of_recording(label, first) for label in bad)
-        for label in (each for each in mine if first not in (None, each) and each not in bad):
-            for link in _since(alone[first], model, named[label], alarm, progress):
+        for label in (each for each in mine if each not in (first, *bad)):
+            for link in _since(alone[first].known, model, named[label], alarm, progress):
                 yield _told(first, label, link, f"{rig}/" if len(of_rigs) > 1 else "")
 
 
@@ -67,17 +75,18 @@ def _told(first: str, later: str, link: Link, rig: str) -> dict[str, Any]:
     return told.of_link(first, later, f"{rig}{link.name}", way, p=link.p_value, instead=instead)
 
 
-def _alone(model: Model, source: Source, progress: Progress) -> Solution | str | None:
-    """What one recording alone knows; `NO_OPTIMUM` where its fit comes to none; None where it has
-    nothing to start from, or lacks what an effect needs."""
+def _alone(model: Model, source: Source, progress: Progress) -> _Alone:
+    """Of a recording, fitted by itself."""
     try:
         problem = build([source], model)
         estimate = solve(problem, progress=progress)
     except InputError:
-        return None
+        return _Alone(None, can_fit=False)
+    if not estimate.converged:
+        return _Alone(None, can_fit=True)
     seen = errors_at(estimate.problem, estimate.values)
     known = widened(intervals(shapes_freed(estimate, model), progress), estimate, seen)
-    return solution_of(problem, estimate, known) if estimate.converged else NO_OPTIMUM
+    return _Alone(solution_of(problem, estimate, known), can_fit=True)
 
 
 def _since(

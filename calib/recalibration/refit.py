@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from calib.problem import Problem
 from calib.problem.model import Model
 from calib.problem.prior import JointPrior
@@ -16,6 +18,13 @@ from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, shapes_freed, solve
 
 
+class _Fit(NamedTuple):
+    """What a fit tells of all that the prior holds; and all of it, as of `solve_from`."""
+
+    told: RefittedPrior
+    whole: tuple[Estimate, Estimate, Intervals]
+
+
 def solve_from(
     problem: Problem, model: Model, prior: JointPrior, progress: Progress, alarm: float = ALARM
 ) -> tuple[Estimate, Estimate, Intervals, list[Link]]:
@@ -23,20 +32,25 @@ def solve_from(
     same with its shapes among the unknowns, the intervals of that, and what became of each link;
     see `let_go` and `shapes_freed`.
     """
-    found: list[tuple[Estimate, Estimate, Intervals]] = []
+    found: list[_Fit] = []
 
-    def fit(prior: JointPrior) -> RefittedPrior:
+    def fit(held: JointPrior) -> RefittedPrior:
+        again = found and held is prior  # with which `let_go` begins, and may end
+        found.append(found[0] if again else fit_anew(held))
+        return found[-1].told
+
+    def fit_anew(prior: JointPrior) -> _Fit:
         estimate = solve(problem, prior, progress=progress)
         freed = shapes_freed(estimate, model, prior)
         known = intervals(freed, progress)
-        found.append((estimate, freed, known))
         seen = errors_at(estimate.problem, estimate.values)
         wide = widened(known, estimate, seen, prior.variables)
         held, at_least = (each.of(prior.variables) for each in (known, wide))
         moved, turned = change(prior, estimate.values)
         covariances = (held.graph, held.covariance, at_least.covariance)
         graph, covariance, widest = (turned @ each @ turned.T for each in covariances)
-        return RefittedPrior(moved, graph, covariance, widest, converged=estimate.converged)
+        now = RefittedPrior(moved, graph, covariance, widest, converged=estimate.converged)
+        return _Fit(now, (estimate, freed, known))
 
     links = let_go(prior, fit, alarm)
-    return *found[-1], links
+    return *found[-1].whole, links

@@ -32,7 +32,7 @@ from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
 from calib.solve.components import NO_CHECKS, Sums, sigma_beyond, spreads, squares
 from calib.solve.components.checks import Checks
-from calib.solve.components.told import LEAST_SD, Told, told
+from calib.solve.components.told import LEAST_SD, Told, slices, told
 from calib.solve.estimate import Estimate
 
 ALPHA_SCATTER = LEVELS["scatter by chance"]
@@ -231,8 +231,7 @@ def chances(
         at = np.concatenate(mine)
         score, information = scores.score[at], scores.information[np.ix_(at, at)]
         rows = Told(score, information, np.zeros(len(at), int))
-        ends = np.cumsum([0, *map(len, mine)]).tolist()
-        rows = rows.about_means(map(slice, ends, ends[1:])).of_noisier(noisier)
+        rows = rows.about_means(slices(map(len, mine))).of_noisier(noisier)
         found.append(_of_values(effect, rows))
     return [chance for chance in found if chance is not None]
 

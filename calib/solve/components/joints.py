@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from calib.linear.system import Linearisation, Values
 from calib.problem.spread import Whose
 from calib.problem.unknowns import Unknown, is_read
 from calib.solve.components.checks import Checks
-from calib.solve.components.told import Told, ToldApart
+from calib.solve.components.told import Told, ToldApart, slices
 
 READINGS_TOGETHER = 120  # whose covariance is computed at once: of 17 stops of seven joints
 # Stops, from which each tells its own alone. What they tell of each other goes as one over their
@@ -126,10 +125,8 @@ def _part(
     rows = over_all([Entries.one_each(1.0 / sigma, columns)], linear.layout.size)
     of_each = np.concatenate([number[number >= 0] for _, number in numbered])
     variance = np.concatenate([np.full(len(at), 1.0 / u.weight) for u, at in pairs])
-    covariance, ends = linear.covariance(rows, kept), [len(sigma)]
-    if apart:
-        ends = np.cumsum([len(at) for _, at in pairs]).tolist()
-    some = [slice(*each) for each in pairwise([0, *ends])]
+    covariance = linear.covariance(rows, kept)
+    some = slices(len(at) for _, at in pairs) if apart else [slice(0, len(sigma))]
     return [Told.fitted(scaled[s], covariance[s, s], variance[s], of_each[s]) for s in some]
 
 

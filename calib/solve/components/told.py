@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -228,9 +229,14 @@ def told(some: Sequence[Unknown], values: Mapping[str, np.ndarray], covariance: 
         np.square(np.concatenate([u.sigma for u in some])),
         groups(some),
     )
-    ends = np.cumsum([0, *(u.dim for u in some)]).tolist()
-    pairs = zip(some, map(slice, ends, ends[1:]), strict=False)
+    pairs = zip(some, slices(u.dim for u in some), strict=True)
     return out.about_means(which for u, which in pairs if len(spread_keys(u)) == 1)
+
+
+def slices(sizes: Iterable[int]) -> list[slice]:
+    """Where the values of each of some unknowns of these sizes stand among those of all."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [slice(*each) for each in pairwise(ends)]
 
 
 def groups(some: Sequence[Unknown]) -> np.ndarray:
