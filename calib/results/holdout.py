@@ -11,12 +11,14 @@ import numpy as np
 from scipy import special
 
 from calib import problem as problems
+from calib.forward import Stops
 from calib.linear.parallel import over_stops
 from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.spread import spread_of, with_spread
 from calib.problem.surfaces import parts_of
+from calib.problem.unknowns import Role
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
@@ -297,9 +299,9 @@ def predict(
     predicted, told = placed(unseen, trained, estimate)
     if not scans:
         beyond = [b for b in bodies if b.stops.rig.joints_to(b.body)]
-        judged = [b for b in beyond if b.stops.root in told]
+        judged = [b for b in beyond if told(b.stops)]
         return body_errors(judged, predicted.values, predicted)
-    known = [Foretold.of(s, predicted) if s.stops.root in told else None for s in scans]
+    known = [Foretold.of(s, predicted) if told(s.stops) else None for s in scans]
     work, out = partial(_unseen, predicted.values, keep and keep.of), Errors()
     for scan, (errors, kept) in zip(scans, over_stops(work, scans, known), strict=True):
         out += errors
@@ -308,18 +310,21 @@ def predict(
     return out
 
 
-def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estimate, set[str]]:
+def placed(
+    unseen: Problem, trained: Problem, estimate: Estimate
+) -> tuple[Estimate, Callable[[Stops], bool]]:
     """Where stops stand whose calibration comes from an estimate of another problem.
 
     Poses of the unseen stops are found from their tracked bodies and levels; where no body is seen,
-    from their own beams with the calibration held.
+    or joints are not read and no body beyond them is seen, from their own beams with the
+    calibration held.
 
     Args:
         unseen: the stops' problem; what does not place them is taken out of it.
         trained, estimate: the other problem, and what was estimated from it.
 
     Returns:
-        The estimate, and the poses' variables that tracked bodies or the other problem told.
+        The estimate, and whether tracked bodies or the other problem told where stops stand.
     """
     shared = [n for n in trained.variables if n in unseen.variables]
     held = [trained.variables[n] for n in shared]
@@ -330,8 +335,14 @@ def placed(unseen: Problem, trained: Problem, estimate: Estimate) -> tuple[Estim
     # Without a LiDAR, bodies before the joints tell where the rig is; those beyond are judged, and
     # tell of themselves no more than how joints stand that nothing reads.
     unseen.blocks = [b for b in seen if scans or _places(b)]
-    told = {block.stops.root for block in unseen.bodies} | set(shared)
-    unseen.scans = [scan for scan in scans if scan.stops.root not in told]
+    roots = {block.stops.root for block in unseen.bodies} | set(shared)
+    turned = {b.stops.noise for b in unseen.bodies if b.stops.rig.joints_to(b.body)}
+    joints = {name for name, v in unseen.variables.items() if v.role is Role.JOINTS and v.unread}
+
+    def told(stops: Stops) -> bool:
+        return stops.root in roots and (stops.noise not in joints or stops.noise in turned)
+
+    unseen.scans = [scan for scan in scans if not told(scan.stops)]
     return solve(unseen, prior, spread=False), told
 
 

@@ -13,8 +13,9 @@ from calib.diagnosis.candidates import concerned
 from calib.effects import CATALOGUE
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.problem.without import leave_out
 from calib.results.check import check
-from calib.results.holdout import FOLDS, POSE_BLOCKS, folds, pose_blocks, unit_of
+from calib.results.holdout import FOLDS, POSE_BLOCKS, folds, held_out, pose_blocks, unit_of
 from calib.results.intervals import intervals
 from calib.results.reach import Reach, joint_range, reach
 from calib.results.solution import solution_of
@@ -25,6 +26,10 @@ from calib.solve.fit import solve
 from . import rigs
 
 SMALL = Model(("arm_link_length", "arm_joint_offset"))
+
+
+def quiet(*_):
+    pass
 
 
 def arm_alone(folder, **changes):
@@ -267,3 +272,26 @@ def test_an_arm_whose_base_nothing_tracks_is_predicted_in_the_trackers_frame(sou
     found, known = reach(problem, estimate), intervals(estimate)
     twice = replace(known, wider=np.ones(len(known.graph))).at_least(2.0)
     assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)
+
+
+def test_a_pose_whose_joints_are_left_out_is_not_predicted(source):
+    """Nothing else tells where its body should be; the readings are what is in doubt."""
+    (less,) = leave_out([source], [f"{source.recording.stops[0]}:joints"])
+    whole, without = (held_out([s], SMALL, "stop", FOLDS, quiet) for s in (source, less))
+    assert without.count == whole.count - 1
+    # Three stops for four, so others are less well foretold; not as by a joint a radian off.
+    assert whole.floor_mm < without.floor_mm < 2 * whole.floor_mm
+    assert whole.size.floor_mm < without.size.floor_mm < 2 * whole.size.floor_mm
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_scan_whose_joints_are_left_out_is_placed_by_what_else_there_is(tmp_path, seen):
+    """By the body beyond them, or, where that is not seen, by its own beams."""
+    source = Source.open(rigs.write(tmp_path / "rec", seed=4))
+    stop = source.recording.stops[0]
+    tokens = [f"{stop}:joints"] + ([] if seen else [f"{stop}:mount_markers"])
+    (less,) = leave_out([source], tokens)
+    whole, without = (held_out([s], SMALL, "stop", FOLDS, quiet) for s in (source, less))
+    assert without.count == pytest.approx(whole.count, rel=0.05)
+    assert without.floor_mm == pytest.approx(whole.floor_mm, rel=0.2)
+    assert without.rms_mm == pytest.approx(whole.rms_mm, rel=0.2)
