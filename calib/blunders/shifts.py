@@ -99,8 +99,9 @@ def shifts(others: Others) -> list[Shift]:
 
 
 def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[Group]:
-    """Of groups at different places that stand out, those that still do once those before them are
-    left out: what one of them does to the estimate makes others stand out.
+    """Of groups at different places that stand out, those that still do once the others are left
+    out: what one of them does to the estimate makes others stand out. Taken up one by one, the
+    worst first, and dropped again where those taken up later explain them (stepwise).
 
     With score u and information M of the shifts of all of them (``u = b``, ``M = I - H`` for rows),
     that of one beside others is their Schur complement.
@@ -124,12 +125,20 @@ def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[
     raw = block_diag(*(rows.own_information for rows in every))
     M, u = own.T @ (raw - H) @ own, own.T @ b
     ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
-    gone, alone = np.zeros(0, int), []
-    for (shift, limit), start, end in zip(some, ends, ends[1:], strict=False):
-        at = np.arange(start, end)
-        if _statistic(M, u, np.append(gone, at)) - _statistic(M, u, gone) > limit:
-            gone, alone = np.append(gone, at), [*alone, shift.group]
-    return alone
+    each = [np.arange(start, end) for start, end in zip(ends, ends[1:], strict=False)]
+    limits = [limit for _, limit in some]
+
+    def beside(i: int, kept: Sequence[int]) -> float:
+        """What one explains that some others do not, beyond its limit."""
+        gone = np.concatenate([np.zeros(0, int), *(each[k] for k in kept if k != i)])
+        return _statistic(M, u, np.append(gone, each[i])) - _statistic(M, u, gone) - limits[i]
+
+    kept: list[int] = []
+    for i in range(len(some)):
+        kept += [i] if beside(i, kept) > 0.0 else []
+    while kept and min(beyond := [beside(i, kept) for i in kept]) <= 0.0:
+        del kept[int(np.argmin(beyond))]
+    return [order[i] for i in kept]
 
 
 def beside_bodies(others: Others, whose: Collection[Whose], wild: Collection[Group]) -> Sums:

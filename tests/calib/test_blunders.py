@@ -126,6 +126,13 @@ def test_groups_are_told_apart_by_what_each_adds_to_those_before_it(tmp_path):
     adds = there.together([columns[0], columns[2]]) - there.together([columns[0]])
     for limit, count in ((adds - 1e-5, 2), (adds + 1e-5, 1)):
         assert len(standing_alone(others, [*known, (third, limit)])) == count
+    # The first is dropped again where it adds too little to one that is taken up after it.
+    alone = there.together([columns[0]])
+    beside = there.together([columns[0], columns[3]]) - there.together([columns[3]])
+    fourth = every[order[3]]
+    assert beside + 1e-3 < alone, "else the first would not be taken up"
+    for limit, count in ((beside - 1e-5, 2), (beside + 1e-5, 1)):
+        assert len(standing_alone(others, [(worst, limit), (fourth, -1.0)])) == count
 
 
 @pytest.mark.parametrize("lidar", [True, False], ids=["lidar", "tracker alone"])

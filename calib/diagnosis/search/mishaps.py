@@ -65,7 +65,17 @@ def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[Left
         near = (b for b in look.blunders if each.evidence - b.evidence < ODDS)
         others = [b for b in near if b.found and b.group not in {*loud, each.group}]
         others = [b for b in others if b not in wild and (b.possible or b.group.what == JOINTS)]
-        yield LeftOut(each, [b.group for b in others if len(wild) == 1 or _meet(each, b)])
+        others = [b for b in others if len(wild) == 1 or _meet(each, b)]
+        yield LeftOut(each, [b.group for b in others if _may_be(look, each, b)])
+
+
+def _may_be(look: Look, blunder: Blunder, other: Blunder) -> bool:
+    """Whether nothing of a blunder stands out once the other is left out in its place. Of one
+    place, they err in the same rows."""
+    if blunder.group.place == other.group.place:
+        return True
+    both = [(b.shift, b.limit) for b in (other, blunder)]
+    return blunder.group not in standing_alone(look.others, both)
 
 
 def restored(
