@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -125,7 +126,7 @@ def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[
     raw = block_diag(*(rows.own_information for rows in every))
     M, u = own.T @ (raw - H) @ own, own.T @ b
     ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
-    each = [np.arange(start, end) for start, end in zip(ends, ends[1:], strict=False)]
+    each = [np.arange(start, end) for start, end in pairwise(ends)]
     limits = [limit for _, limit in some]
 
     def beside(i: int, kept: Sequence[int]) -> float:
