@@ -167,4 +167,5 @@ def test_a_body_that_sat_elsewhere_for_a_while_is_not_called_random(tmp_path, ra
     (chance,) = search(stand_of(run, quiet), quiet).chance
     assert chance.effect.name == "tracker_scatter"
     assert ("not at random" in chance.sentence) is not random
+    assert (chance.document(step=1)["p_serial"] < 0.01) is not random
     assert ("random as far as these data show" in chance.sentence) is random

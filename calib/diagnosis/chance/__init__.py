@@ -144,6 +144,7 @@ class Chance:
             "site": "range" if self.effect.site is Site.BEAM else self.effect.site.value,
             "p_value": at_least(self.p_value),
             "p_adjusted": self.p_adjusted,
+            "p_serial": at_least(self.p_serial),
             "statistic": self.statistic,
             "dof": len(self.spreads),
             "step": step,
