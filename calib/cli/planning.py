@@ -92,7 +92,8 @@ def plan(
         raise InputError("give --targets, or --stops and --until; not both")
     opened = run if is_rig(run) else Run.open(run, trust or ())
     more = {"purpose": purpose, "region": region, "candidates": candidates, "seed": seed}
-    folder = out if out is not None and not out.suffix else None
+    # A run's name may have a dot, v1.2, and its plan's is v1.2-plan.
+    folder = out if out is not None and not out.suffix[1:].isalpha() else None
     if folder is not None:
         outputs.refuse(folder, PLANNED, inputs_of(opened))
     with threads(workers), progress_bar() as progress:

@@ -154,11 +154,13 @@ def _inputs(given: Sequence[Given], options: Options, choices: Choices) -> list[
 
 @contextmanager
 def _called(folder: Path, name: Path) -> Iterator[None]:
-    """Complaints about files of a folder name it as its reader will find it."""
+    """Complaints about files of a folder name it as its reader would have found it."""
     try:
         yield
     except InputError as error:
-        raise InputError(str(error).replace(str(folder), str(name))) from None
+        said = str(error).replace(str(folder), str(name))
+        as_made = " (so it would be imported; nothing was written)" if said != str(error) else ""
+        raise InputError(f"{said}{as_made}") from None
 
 
 def _from_rows(gathered: Gathered) -> _Cut:

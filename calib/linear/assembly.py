@@ -112,7 +112,7 @@ class Assembly:
         self.chi2 = sum(float(rows.b @ rows.b) for each in own.values() for rows in each)
         self.touched = np.zeros(layout.size, bool)
         for rows in (r for each in own.values() for r in each if r.measured):
-            self.touched[rows.columns] |= np.any(rows.A != 0, axis=0)
+            self.touched[rows.columns] |= layout.moves(rows.A, rows.columns)
         self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.scans: dict[int, OwnSums] = {}

@@ -19,6 +19,9 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.seen import BodiesTogether, SeenBody
 
 StopKey = tuple[object, int]
+# Of a row's sigma, by which a prior sigma of an unknown moves it: less than that is rounding, of
+# lengths of 1 m in sigmas of 1 um.
+ROUNDED_ROW = 1e-9
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,11 @@ class Layout:
         gone = np.ones(self.size, bool)
         gone[self.kept] = False
         return (name for name, at in self.at.items() if gone[at].any())
+
+    def moves(self, A: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Whether rows (m, n) of measurements depend on unknowns that stand in columns (n,) at all:
+        by more than rounding makes of it."""
+        return (np.abs(A) * self.sigma[columns]).max(axis=0, initial=0.0) > ROUNDED_ROW
 
     def outer(self) -> dict[str, Unknown]:
         """Unknowns that the graph solves for."""

@@ -39,6 +39,7 @@ from calib.linear.linearise import own_rows
 from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
+from calib.problem.unknowns import Role
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -58,10 +59,11 @@ class Intervals:
         graph: (Q, Q) covariance as the graph has it.
         data: (Q, Q) the part of that which is due to errors of rows; the rest is due to priors.
         paper: (Q, Q) the part of it that is due to errors of CAD.
-        earlier: (Q, Q) the part that is due to those of an earlier run, which held how much wider
-            they are than its graph had them.
+        given: (Q, Q) the part that is due to errors of what was known before any row: of CAD, of
+            data sheets, and of an earlier run. How far residuals exceed their sigmas says nothing
+            of these.
         wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
-        least: how many times wider all of them are at least, but for what is due to `earlier`.
+        least: how many times wider all of them are at least, but for what is due to `given`.
         cad: how many times wider than stated values of CAD scatter, at least 1.
     """
 
@@ -70,7 +72,7 @@ class Intervals:
     graph: np.ndarray
     data: np.ndarray
     paper: np.ndarray
-    earlier: np.ndarray
+    given: np.ndarray
     wider: np.ndarray
     least: float = 1.0
     cad: float = 1.0
@@ -80,14 +82,13 @@ class Intervals:
         """(Q, Q). The variance on top of the graph's is correlated as the data's part is: as the
         whole is, it would go to combinations that priors alone determine. The part of CAD is as
         much larger as CAD is worse than it says."""
-        least = self.graph + (self.least**2 - 1.0) * (self.graph - self.earlier)
+        least = self.graph + (self.least**2 - 1.0) * (self.graph - self.given)
         share = np.diag(self.data) / np.diag(self.graph)
         more = np.maximum(np.square(self.wider) - np.diag(least) / np.diag(self.graph), 0.0)
         root = np.sqrt(
             np.where(share > ROUNDED_SHARE, more / np.maximum(share, ROUNDED_SHARE), 0.0)
         )
-        paper = max(self.cad**2 - self.least**2, 0.0) * self.paper
-        return least + np.outer(root, root) * self.data + paper
+        return least + np.outer(root, root) * self.data + (self.cad**2 - 1.0) * self.paper
 
     def of(self, names: Sequence[str]) -> Intervals:
         """Those of some of the unknowns, in the order given."""
@@ -101,7 +102,7 @@ class Intervals:
             graph=self.graph[np.ix_(some, some)],
             data=self.data[np.ix_(some, some)],
             paper=self.paper[np.ix_(some, some)],
-            earlier=self.earlier[np.ix_(some, some)],
+            given=self.given[np.ix_(some, some)],
             wider=self.wider[some],
         )
 
@@ -110,20 +111,21 @@ class Intervals:
         hold, as one stop alone has it, is as well known as by C."""
         known, least = estimate.problem.variables, self.least**2
         found = least * estimate.covariance_of(names)
-        found -= (least - 1.0) * self._due_to_earlier(estimate, names)
+        found -= (least - 1.0) * self._due_to_given(estimate, names)
         held = np.repeat([name in self.names for name in names], [known[n].dim for n in names])
         some = self.of([name for name in names if name in self.names])
-        as_least = least * some.graph - (least - 1.0) * some.earlier
+        as_least = least * some.graph - (least - 1.0) * some.given
         found[np.ix_(held, held)] += some.covariance - as_least
         return found
 
-    def _due_to_earlier(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray | float:
-        """The part of the joint covariance of unknowns of the estimate that is due to errors of an
-        earlier run: of those that the graph does not hold, by how they go with what it holds."""
-        if not self.earlier.any():
+    def _due_to_given(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray | float:
+        """The part of the joint covariance of unknowns of the estimate that is due to errors of
+        what was known before: of those that the graph does not hold, by how they go with what it
+        holds."""
+        if self.least == 1.0:
             return 0.0
         if all(name in self.names for name in names):
-            return self.of(names).earlier
+            return self.of(names).given
         every = [*names, *(name for name in self.names if name not in names)]
         dims = [estimate.problem.variables[name].dim for name in every]
         ends = dict(zip(every, np.cumsum(dims).tolist(), strict=True))
@@ -133,7 +135,7 @@ class Intervals:
         sigma = np.sqrt(np.diag(self.graph))
         across = estimate.covariance_of(every)[np.ix_(mine, at)] / sigma
         by = np.linalg.solve(self.graph / np.outer(sigma, sigma), across.T).T / sigma
-        return by @ self.earlier @ by.T
+        return by @ self.given @ by.T
 
     def together(self, estimate: Estimate, names: Sequence[str]) -> np.ndarray:
         """The same for what depends on all of them together, as a place does.
@@ -151,14 +153,14 @@ class Intervals:
         some = self.of([name for name in names if name in self.names])
         share = np.diag(some.data) / np.diag(some.graph)
         factor = 1.0 + (np.square(some.wider) - 1.0) @ share / max(share @ share, ROUNDED_SHARE)
-        more = max(factor - least, 0.0) * some.data + max(self.cad**2 - least, 0.0) * some.paper
-        more += least * some.graph - (least - 1.0) * some.earlier
+        more = max(factor - least, 0.0) * some.data + (self.cad**2 - 1.0) * some.paper
+        more += least * some.graph - (least - 1.0) * some.given
         found[np.ix_(held, held)] += more - some.covariance
         return found
 
     def at_least(self, wider: float, cad: float = 1.0) -> Intervals:
-        """With every interval at least so many times wider than the graph has it, but for what an
-        earlier run knew, and what CAD adds to each so many times larger."""
+        """With every interval at least so many times wider than the graph has it, but for what was
+        known before, and what CAD adds to each so many times larger."""
         return replace(self, least=wider, cad=cad)
 
     def document(self, names: Sequence[str]) -> dict[str, float | str]:
@@ -202,14 +204,13 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     for cells, scatter in beams.cells():
         sums.add_stop(cells, scatter)
     others = [*of_stops(own_rows(layout, values)), *_of_cells(estimate, places)]
-    frames, paper, earlier = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
+    frames, paper, given = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
     for block, name, rows in of_graph(estimate.graph, layout, values):
-        if block is None and name in frames:
+        stated = block is None and problem.variables[name].role is Role.CALIBRATION
+        if stated or isinstance(block, JointPrior):
             A = rows.A @ directions[rows.columns]
-            paper += A.T @ A
-        if isinstance(block, JointPrior):
-            A = rows.A @ directions[rows.columns]
-            earlier += A.T @ A
+            given += A.T @ A
+            paper += A.T @ A if stated and name in frames else 0.0
         if block is not None and block.kind == "target":
             rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
         if not isinstance(block, KeptRows):
@@ -227,7 +228,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         graph=estimate.kept,
         data=estimate.kept - sums.priors * np.outer(sigma, sigma),
         paper=paper * np.outer(sigma, sigma),
-        earlier=earlier * np.outer(sigma, sigma),
+        given=given * np.outer(sigma, sigma),
         wider=sums.wider(),
     )
 

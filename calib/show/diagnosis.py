@@ -64,7 +64,9 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
     if tied:
         print_pairs(console, "not distinguishable on these data", tied)
     if diagnosis.plan:
-        print_command(console, diagnosis.plan, "Stops that would separate them are planned by:")
+        print_command(
+            console, diagnosis.plan, "Stops that separate what these do not are planned by:"
+        )
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if adequate:
@@ -205,7 +207,9 @@ def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> No
         sigma = "" if d["sigma_mm"] is None else f" ± {d['sigma_mm']:.2f} mm"
         rows.append((f"{', '.join(d['parameters'])}{sigma}", d["needs"]))
     if rows:
-        print_pairs(console, "weakly determined, and what would determine it", rows)
+        print_pairs(
+            console, "weakly determined (an angle: at 1 m), and what would determine it", rows
+        )
 
 
 def _print_remedies(console: Console, diagnosis: Diagnosis) -> None:

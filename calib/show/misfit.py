@@ -98,8 +98,6 @@ def misfit_warnings(summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _widened(summary: Mapping[str, Any]) -> str:
     """What is wider where residuals exceed their sigmas."""
-    if "links" not in summary:
-        return "every sigma above is widened by that"
-    moved = any(link["moved"] for link in summary["links"])
+    moved = any(link["moved"] for link in summary.get("links", ()))
     doubt = ", and what moved may have moved because of it" if moved else ""
     return f"of every sigma above, the part that these data tell is widened by that{doubt}"

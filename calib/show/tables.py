@@ -15,6 +15,7 @@ from rich.text import Text
 
 from calib.blunders.chance import LEAST_P
 from calib.diagnosis.suggest import span
+from calib.effects import CATALOGUE
 from calib.results.outstanding import shown, standing_out
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.headline import MOVED_WORDS, Words, by_what_became, closing, moved_sentence
@@ -138,17 +139,18 @@ def effect_page(effect: Effect) -> dict[str, Any]:
 
 def print_catalogue(effects: Sequence[Effect], whole: bool) -> None:
     """Print the catalogue as a list, or the whole page of each effect."""
-    console = terminal()
-    pages = [effect_page(effect) for effect in effects]
+    console, pages = terminal(), [effect_page(effect) for effect in effects]
     if whole:
-        for page in pages:
+        known = {effect.family for effect in CATALOGUE}
+        for effect, page in zip(effects, pages, strict=True):
             for several in ("confounded_with", "covariates"):
                 page[several] = ", ".join(page[several])
             name = page.pop("name")
             print_pairs(
                 console, name, [(k.replace("_", " "), text) for k, text in page.items() if text]
             )
-            print_command(console, f"rigcal effects {name} -o {name}.svg", "A picture of it:")
+            if effect.family in known:  # one's own may be of a joint or body that no other rig has
+                print_command(console, f"rigcal effects {name} -o {name}.svg", "A picture of it:")
         return
     table = columns_table("effect", "what")
     table.columns[0].min_width = max(len(page["name"]) for page in pages)

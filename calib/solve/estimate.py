@@ -124,7 +124,8 @@ class Estimate:
         for block in layout.others:
             derivative = block.evaluate(self.values, derivatives=True)[1]
             for name in (n for n in derivative if n in layout.at):
-                seen[layout.at[name]] |= np.abs(derivative[name]).max(axis=0) > 0
+                columns = layout.columns([name])
+                seen[columns] |= layout.moves(derivative[name], columns)
         return seen[layout.columns([v.name for v in self.variables])]
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:

@@ -89,13 +89,13 @@ def check_metres(where: str, xyz_m: ArrayLike, unit: str | None) -> None:
     """Refuse positions that no tracker sees, unless somebody said what unit they are in.
 
     Raises:
-        InputError: nobody did, and half of them lie beyond 50 m; the flag is --length-unit.
+        InputError: nobody did, and one of them lies beyond `FARTHEST`; the flag is --length-unit.
     """
-    with np.errstate(invalid="ignore"):
-        size = np.abs(np.asarray(xyz_m, float))
-    if unit is None and np.isfinite(size).any() and np.nanmax(size) > FARTHEST:
+    size = np.abs(np.asarray(xyz_m, float))
+    size = size[np.isfinite(size)]
+    if unit is None and size.max(initial=0.0) > FARTHEST:
         raise InputError(
-            f"{where}: a position is {np.nanmax(size):.0f} from the origin, which looks like "
+            f"{where}: a position is {size.max():.0f} from the origin, which looks like "
             "millimetres; say --length-unit mm, cm or m"
         )
 

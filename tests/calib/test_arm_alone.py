@@ -54,6 +54,11 @@ def bent(source, at_m, **changes):
     return SimpleNamespace(rig=source.rig, recording=SimpleNamespace(**(said | changes)))
 
 
+def as_if_rows_told_all(known):
+    """Intervals as the graph has them, of which nothing is due to rig.yaml."""
+    return replace(known, wider=np.ones(len(known.graph)), given=0.0 * known.given)
+
+
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
     return Source.open(arm_alone(tmp_path_factory.mktemp("arm") / "rec"))
@@ -149,7 +154,7 @@ def test_what_is_predicted_is_what_the_covariance_does_to_the_chain(solved, sour
     assert found.at_poses_m == pytest.approx(apart(seen), rel=0.06)
     assert found.is_small and found.box_share < 0.1 and "add poses" in found.warning
     known = intervals(estimate)
-    twice = replace(known, wider=np.ones(len(known.graph))).at_least(2.0)
+    twice = as_if_rows_told_all(known).at_least(2.0)
     assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)
 
 
@@ -235,7 +240,9 @@ def test_wider_sigmas_never_make_a_place_better_known(shared, tmp_path):
         sizes = [getattr(each, at) for each in found]
         assert np.all(np.diff(sizes) > -1e-3 * sizes[0]), at  # of a sample
         assert sizes[0] > getattr(plain, at), at
-        assert sizes[-1] == pytest.approx(8.0 * getattr(plain, at), rel=1e-6), at
+        assert sizes[-1] == pytest.approx(8.0 * getattr(plain, at), rel=0.05), (
+            "rows tell nearly all"
+        )
 
 
 # -------------------------------------------------------------------------------- what is not there
@@ -270,7 +277,7 @@ def test_an_arm_whose_base_nothing_tracks_is_predicted_in_the_trackers_frame(sou
     problem = build([alone], SMALL)
     estimate = solve(problem)
     found, known = reach(problem, estimate), intervals(estimate)
-    twice = replace(known, wider=np.ones(len(known.graph))).at_least(2.0)
+    twice = as_if_rows_told_all(known).at_least(2.0)
     assert reach(problem, estimate, twice).anywhere_m == pytest.approx(2 * found.anywhere_m)
 
 

@@ -53,7 +53,7 @@ def as_the_graph_has_them(estimate, _):
         graph=C,
         data=C,
         paper=np.zeros_like(C),
-        earlier=np.zeros_like(C),
+        given=np.zeros_like(C),
         wider=np.ones(len(C)),
     )
 

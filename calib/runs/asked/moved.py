@@ -198,8 +198,7 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     weight = np.linalg.inv(graph)
     information = _nowhere_negative(weight - np.diag(cad))
     force = weight @ (pair.change / sigma) + cad * np.concatenate(then) / sigma
-    least, wider = b.summary["sigmas_widened_by"], b.summary.get("cad_widened_by", 1.0)
-    of_cad = cad * (least**2 - 1.0 + max(wider**2 - least**2, 0.0) * pair.is_frame)
+    of_cad = cad * (b.summary.get("cad_widened_by", 1.0) ** 2 - 1.0) * pair.is_frame
     beyond = _nowhere_negative(weight @ (reported - graph) @ weight - np.diag(of_cad))
 
     data = NewerData(information / scale, force / sigma, beyond / scale)

@@ -254,7 +254,7 @@ def _in_si(
     said, out = [], dict(table)
     for joint in joints:
         length = options.joints[joint] == "prismatic"
-        out[joint], unit = _joint(path, joint, table[joint], columns[joint].unit, length, options)
+        out[joint], unit = _joint(path, joint, table[joint], columns[joint], length, options)
         said += [f"{path.name}: {joint} in {unit}"] if unit not in ("rad", "m") else []
     for body in dict.fromkeys(n.rpartition(".")[0] for n in table if n.endswith((".x", ".rx"))):
         part = {p: out.pop(f"{body}.{p}") for p in (*POSE, *EULER) if f"{body}.{p}" in out}
@@ -285,18 +285,19 @@ def _in_si(
 
 
 def _joint(
-    path: Path, name: str, values: Array, written: str | None, length: bool, options: Options
+    path: Path, name: str, values: Array, column: _Column, length: bool, options: Options
 ) -> tuple[Array, str]:
     """A joint's values in rad or m, and the unit they were in."""
     if length:
-        unit = written or options.length_unit or "m"
+        unit = column.unit or options.length_unit or "m"
         return values * LENGTHS.get(unit, 1.0), unit
-    unit = written or options.angle_unit
+    unit = column.unit or options.angle_unit
     with np.errstate(invalid="ignore"):
         if unit is None and np.nanmax(np.abs(values), initial=0) > 4 * np.pi:
             raise InputError(
                 f"{path}: joint {name} goes to {np.nanmax(np.abs(values)):.4g}, which looks like "
-                "degrees; say --angle-unit deg (or rad)"
+                f"degrees; say --column '{name}={column.theirs}[deg]' if it alone is in degrees, "
+                "--angle-unit deg if all joints are, or rad if it turns that far"
             )
     return values * ANGLES.get(unit or "rad", 1.0), unit or "rad"
 
