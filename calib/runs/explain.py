@@ -93,9 +93,7 @@ def explain(
         own_effects((), candidates)  # what is wrong with a file is said before the first fit
         climb = _Climb(recordings, out, progress, candidates)
         climb.first(model or Model.of(None, (), (), recordings))
-        diagnosis = diagnose(climb.run, climb.tell, False, candidates)
-        while len(climb.runs) < MOST_RUNGS and climb.improve(diagnosis):
-            diagnosis = diagnose(climb.run, climb.tell, False, candidates)
+        diagnosis = climb.to_the_top()
         climb.clear_above()
         kept = _keep_formulas(climb.run, entries)
         files = [out / KEPT_EFFECTS / path.name for path in kept]
@@ -157,6 +155,22 @@ class _Climb:
             run = calibrate(self.recordings, folder, model, progress=self.tell)
         self._keep(run, [], [])
 
+    def to_the_top(self) -> Diagnosis:
+        """Rung after rung; the last diagnosis. Each rung shows by itself whether the held-out error
+        falls with what was found. Where it does not fall, the diagnosis is made once more with the
+        fits that show it, and says what there is instead."""
+        refits, diagnosis = False, diagnose(self.run, self.tell, False, self.candidates)
+        while len(self.runs) < MOST_RUNGS:
+            found = {*diagnosis.worth_adding, *diagnosis.formulas}
+            if self.improve(diagnosis):
+                refits = False
+            elif refits or found.isdisjoint(self.refused):
+                break
+            else:
+                refits = True
+            diagnosis = diagnose(self.run, self.tell, refits, self.candidates)
+        return diagnosis
+
     def improve(self, diagnosis: Diagnosis) -> bool:
         """Leave out blunders; or else add what lowers the held-out error, and drop what that made
         idle. Whether anything was changed."""
@@ -171,11 +185,12 @@ class _Climb:
             for each in diagnosis.candidates
             if any(rival["dof"] > each["dof"] for rival in each["rivals"])
         }
+        rivals = {c["add"]: [r["add"] for r in c["rivals"]] for c in diagnosis.candidates}
         names = [*diagnosis.worth_adding, *self._formulas]
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
-        for name in names:
-            self._add(name)
+        for name in names:  # or the first of those that nothing told it apart from
+            any(map(self._add, [name, *rivals.get(name, [])]))
         if len(self.runs) == before:
             return False
         for name in earlier:
@@ -190,7 +205,8 @@ class _Climb:
             if folder.name.isdigit() and int(folder.name) >= len(self.runs):
                 outputs.remove(folder)
 
-    def _add(self, name: str) -> None:
+    def _add(self, name: str) -> bool:
+        """Add an effect, if the error falls with it. Whether it is in the model."""
         described = self._formulas.get(name)
         if described is not None:
             effects = (read(described, self.run.folder / DIAGNOSIS, {}),)
@@ -199,6 +215,7 @@ class _Climb:
         families = {effect.family for effect in self._model.effects}
         if name not in self.refused and effects[0].family not in families:
             self._try(self._model.plus(effects), [name], [])
+        return any(effect.family == effects[0].family for effect in self._model.effects)
 
     def _leave_out(self, tokens: list[str]) -> None:
         """A rung with the same model, and less data: its errors say nothing against it."""

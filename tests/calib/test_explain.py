@@ -32,7 +32,7 @@ class World:
 
     def __init__(self, errors, named, spoiled=(), judged=None, each=None):
         self.errors, self.named, self.spoiled, self.fits = errors, named, spoiled, []
-        self.judged, self.each = judged or {}, each or {}
+        self.judged, self.each, self.refits = judged or {}, each or {}, []
 
     def run(self, out, model, below=None):
         names = frozenset(model.names) - frozenset(Model().names)
@@ -45,6 +45,7 @@ class World:
         return Run(out, model.document() | {"grown_from": grown_from}, summary, None)
 
     def diagnose(self, run, progress, refits, candidates=()):
+        self.refits.append(refits)
         names = frozenset(run.effects) - frozenset(Model().names)
         adding = self.named.get(names, [])
         verdict = "missing_effect" if adding else "adequate"
@@ -134,12 +135,30 @@ def test_a_later_one_with_a_more_general_rival_must_help_at_most_stops(climbed, 
     each = {of(A): [5.0, 5.0, 5.0, 5.0]}
     each[of(A, B)] = [4.0, 4.1, 3.9, 4.0] if steady else [5.2, 5.1, 5.2, 0.0]
     errors = {of(): 9.0, of(A): 5.0, of(A, B): 4.0, of(B): 8.0}
-    judged = {B: {"dof": 2, "rivals": [{"dof": 4 if general else 2}]}}
+    judged = {B: {"dof": 2, "rivals": [{"add": A, "dof": 4 if general else 2}]}}
     found = climbed(World(errors, {of(): [A], of(A): [B]}, (), judged, each))
     assert [s["added"] for s in found.steps][1:] == (
         [[A]] if general and not steady else [[A], [B]]
     )
     assert found.refused == ([B] if general and not steady else [])
+
+
+def test_where_a_name_is_refused_what_nothing_told_it_apart_from_is_tried(climbed):
+    judged = {A: {"dof": 1, "rivals": [{"add": B, "dof": 1}, {"add": C, "dof": 1}]}}
+    errors = {of(): 9.0, of(A): 9.5, of(B): 5.0, of(C): 4.0}
+    found = climbed(World(errors, {of(): [A], of(B): []}, (), judged))
+    assert [s["added"] for s in found.steps] == [[], [B]] and found.refused == [A]
+
+
+@pytest.mark.parametrize("last", [[B], []], ids=["refused", "calm"])
+def test_where_the_last_name_is_refused_the_diagnosis_looks_at_stops_held_out(climbed, last):
+    """As ``rigcal diagnose`` of that rung does, so that both say the same of it."""
+    world = World({of(): 9.0, of(A): 5.0, of(A, B): 5.5}, {of(): [A], of(A): last})
+    assert climbed(world).refused == last and world.refits == [
+        False,
+        False,
+        *([True] if last else []),
+    ]
 
 
 def test_at_the_noise_floor_any_fall_counts(climbed):
