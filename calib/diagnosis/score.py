@@ -281,15 +281,19 @@ def evidence(statistic: float, dof: int, common: float) -> float:
     return -log_tail(statistic / max(common, 1e-300), dof)
 
 
-def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
-    """Test the candidate of these columns."""
+def whitening(scores: Scores, columns: np.ndarray) -> np.ndarray:
+    """What (q, r) makes the scores of some columns (q,) r independent ones of variance 1."""
     size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
     block = scores.information[np.ix_(columns, columns)]
     values, axes = np.linalg.eigh(block / np.outer(size, size))
     seen = values > GAUGE
-    whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
-    score = scores.score[columns]
+    return (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
+
+
+def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
+    """Test the candidate of these columns."""
+    whiten, score = whitening(scores, columns), scores.score[columns]
     clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
     return ScoreTest(
         columns=columns,

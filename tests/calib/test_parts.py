@@ -58,6 +58,18 @@ def test_what_one_joint_does_is_told_by_its_own_parameters(look, name, joint):
     assert part.evidence(1.0) > candidate.test.evidence(1.0)
 
 
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("joints", [(1, 2), (2, 4)])
+def test_what_two_joints_do_is_told_by_theirs(look, name, joints):
+    """At the price of having looked at every pair of six."""
+    each = EFFECTS[name]
+    theta = 0.01 * np.repeat(np.isin(np.arange(6), joints), each)
+    moved, candidate = acting(look, name, theta)
+    part = likeliest_part(moved, candidate, 1.0)
+    assert each < part.dof <= 2 * each and part.price == pytest.approx(np.log(15))
+    assert part.statistic == pytest.approx(candidate.test.statistic, rel=1e-6)
+
+
 def test_what_all_joints_do_is_told_by_all(look):
     theta = np.where(np.arange(6) % 2, 0.01, -0.01)
     moved, candidate = acting(look, "arm_joint_scale", theta)

@@ -1,17 +1,18 @@
-"""What of an effect explains most: all of it, or what one joint of the arm does.
+"""What of an effect explains most: all of it, or what one joint of the arm does, or a few.
 
 Joints wear, and are wired and zeroed, one by one: an effect with parameters for each of them is
-often that of one. At the price of all its parameters it would then lose against any function of
-that joint, of fewer.
+often that of one or two. At the price of all its parameters it would then lose against any function
+of these joints, of fewer.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
-from calib.diagnosis.score import evidence, score_test
+from calib.diagnosis.score import Scores, evidence, whitening
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.stand import Look
 
@@ -42,7 +43,8 @@ class Explained:
 
 
 def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained:
-    """Of a candidate of a look all of it, or the joint of most evidence.
+    """Of a candidate of a look all of it, or the joints of most evidence: that which has most by
+    itself, and with it one by one those that add most.
 
     Args:
         look: at which it was tested.
@@ -50,15 +52,24 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
         common: as of `ScoreTest.evidence`.
     """
     test = candidate.test
-    whole = Explained(test.statistic, test.dof)
     rig = look.stand.sources[0].rig
     of = np.array([rig.joint_of(param.name) for param in candidate.effect.params(rig)])
-    joints = np.unique(of[of != ""])
-    if len(of) != len(test.columns) or len(joints) < 2:
-        return whole
+    joints = [] if len(of) != len(test.columns) else np.unique(of[of != ""]).tolist()
+    found, count = [Explained(test.statistic, test.dof)], len(joints)
     score = look.named.scores.score.copy()
     score[test.columns] = test.score  # in the shape that it was tested in
-    scores, price = replace(look.named.scores, score=score), float(np.log(len(joints)))
-    each = (score_test(scores, test.columns[of == joint]) for joint in joints)
-    parts = [Explained(own.statistic, own.dof, price) for own in each if own.dof]
-    return max([whole, *parts], key=lambda part: part.evidence(common))
+    scores, taken = replace(look.named.scores, score=score), []
+    while len(joints) > 1:
+        price = float(np.log(comb(count, len(taken) + 1)))
+        each = [_explained(scores, test.columns[np.isin(of, [*taken, j])], price) for j in joints]
+        best = int(np.argmax([part.evidence(common) if part.dof else -np.inf for part in each]))
+        found, taken = [*found, each[best]], [*taken, joints.pop(best)]
+    told = [part for part in found if part.dof] or found
+    return max(told, key=lambda part: part.evidence(common))
+
+
+def _explained(scores: Scores, columns: np.ndarray, price: float) -> Explained:
+    """What some columns explain."""
+    whiten = whitening(scores, columns)
+    statistic = float(np.sum(np.square(whiten.T @ scores.score[columns])))
+    return Explained(statistic, whiten.shape[1], price)
