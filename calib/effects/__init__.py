@@ -48,6 +48,7 @@ from calib.effects.beams import (
 from calib.effects.elastic import (
     ArmGravitySag,
     ArmLinkBending,
+    ArmPayloadOffset,
     ArmPayloadSag,
     ArmTorqueSag,
     BaseFlex,
@@ -131,6 +132,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmJointEccentricity(),
     ArmGravitySag(),
     ArmPayloadSag(),
+    ArmPayloadOffset(),
     ArmTorqueSag(),
     ArmLinkBending(),
     ArmBacklash(),

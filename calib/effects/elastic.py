@@ -6,6 +6,8 @@ is where levels say; without any, the root's z axis is taken to point up.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
@@ -66,6 +68,45 @@ class ArmPayloadSag(ArmGravitySag):
         """What each joint (K, J) gives way to, N m or N."""
         payloads = _payloads(view) or view[PAYLOAD]  # which says that there is no such column
         return gravity_torque(view.rig.tree, payloads, view.joints, up(view))
+
+
+class ArmPayloadOffset(Effect):
+    """The payload's centre of mass lies beside the tip. Joints give way to the torque of that.
+
+    All revolute joints are taken to be as soft as each other: an amount is their compliance times
+    how far the centre lies from the tip, along the tip's axes. Beside `arm_gravity_sag`, which
+    tells the compliance, it tells that distance.
+    """
+
+    name = "arm_payload_offset"
+    site = Site.JOINTS
+    unit = "rad/N"
+    formula = "q_i = reported_i + o . torque about joint i of the payload, 1 m along each axis"
+    typical = "0.2 m at 0.00003 rad/(N m): 0.000006 rad/N, size assumed"
+    covariates = ("joints", "payload_kg")
+    confounded_with = ("arm_gravity_sag", "arm_payload_sag", "arm_link_bending")
+    source = "stiffness of arms: Klimchik et al.; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        several = len(rig.tips) > 1
+        names = (f"{tip}.{axis}" if several else axis for tip in rig.tips for axis in "xyz")
+        return tuple(Param(name, self.unit, 0.2 * SOFT) for name in names)
+
+    def basis(self, view: View) -> np.ndarray:
+        rig, payloads = view.rig, _payloads(view) or view[PAYLOAD]
+        turning = np.array([kind == "revolute" for kind in rig.joint_kinds], float)
+        basis = np.zeros((len(view.joints), len(turning), 3 * len(rig.tips)))
+
+        def torque(payload: Mass, centre_m: np.ndarray) -> np.ndarray:
+            moved = replace(payload, centre_m=centre_m)
+            return gravity_torque(rig.tree, [moved], view.joints, up(view))
+
+        for payload in payloads:
+            first = 3 * rig.tips.index(payload.frame)
+            there = torque(payload, np.zeros(3))
+            for k, axis in enumerate(np.eye(3)):
+                basis[:, :, first + k] = turning * (torque(payload, axis) - there)
+        return basis
 
 
 class ArmTorqueSag(ArmGravitySag):

@@ -123,7 +123,7 @@ def cases(asked_for: argparse.Namespace) -> Iterator[Case]:
     for kind in (k for k in KINDS if fnmatch(k, asked_for.kinds)):
         for arm in arms:
             turns = any(row[0] != "P" for row in TABLES[arm])
-            if turns or kind not in ("eccentricity", "gear"):
+            if turns or kind not in ("eccentricity", "gear", "payload offset"):
                 yield arm, kind, asked_for.size, asked_for.poses
 
 

@@ -86,20 +86,34 @@ def tool(world: ArmWorld, tip: RigidTransform) -> RigidTransform:
     )
 
 
-def height(world: ArmWorld, q: np.ndarray, payload: np.ndarray | float, links: float) -> np.ndarray:
-    """Weight times height (K,), N m."""
+def height(
+    world: ArmWorld,
+    q: np.ndarray,
+    payload: np.ndarray | float,
+    links: float,
+    beside_m: np.ndarray | None = None,
+) -> np.ndarray:
+    """Weight times height (K,), N m; of a payload at the arm's end, or beside it in its axes."""
     up = world.T_world_base.rotation.inv().apply([0.0, 0.0, 1.0])
     *moved, tip = places(world, q)
     weighed = sum(links * (T.translation @ up) for T in moved)
-    return G * (weighed + payload * (tip.translation @ up))
+    centre = tip.translation if beside_m is None else tip.apply(beside_m)
+    return G * (weighed + payload * (centre @ up))
 
 
-def torques(world: ArmWorld, s: Session, payload: np.ndarray | float, links: float) -> np.ndarray:
+def torques(
+    world: ArmWorld,
+    s: Session,
+    payload: np.ndarray | float,
+    links: float,
+    beside_m: np.ndarray | None = None,
+) -> np.ndarray:
     """What gravity does to every joint (K, J): minus the slope of weight times height."""
     out = np.empty_like(s.joints)
     for j in range(s.joints.shape[1]):
         step = TURN * np.eye(s.joints.shape[1])[j]
-        high, low = (height(world, s.joints + k * step, payload, links) for k in (1, -1))
+        turned = (s.joints + k * step for k in (1, -1))
+        high, low = (height(world, q, payload, links, beside_m) for q in turned)
         out[:, j] = -(high - low) / (2 * TURN)
     return out
 
@@ -124,6 +138,13 @@ def gravity_sag(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
 
 def payload_sag(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
     return _turning(world, s, np.abs(_each(rng, s)) * torques(world, s, s.payload_kg, 0.0))
+
+
+def payload_offset(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    """Of joints that are not as soft as each other, nor are sliding ones soft."""
+    where = 0.2 * rng.normal(size=3)
+    beside, at = (torques(world, s, s.payload_kg, 0.0, each) for each in (where, None))
+    return _turning(world, s, np.abs(_each(rng, s)) * (beside - at) * _revolute(world))
 
 
 def torque_sag(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
@@ -318,6 +339,7 @@ KINDS: Mapping[str, Kind] = {
     "tracker settle": _kind(tracker_settle, "tracker_settle"),
     "body slip": _kind(body_slip, "body_slip", "mount_slip"),
     "tracker scatter": _kind(tracker_scatter, "tracker_scatter"),
+    "payload offset": _kind(payload_offset, "arm_payload_offset", needs=("payload_kg",)),
 }
 
 

@@ -95,6 +95,20 @@ def test_joints_give_way_to_the_payload_alone_by_a_coefficient_of_its_own(source
     assert np.abs(found).max() > 1
 
 
+def test_joints_give_way_to_a_payload_beside_the_tip(source):
+    """By how much higher its centre rises than the tip does."""
+    kg = np.linspace(0, 2, len(source.recording.stops))
+    amount = np.array([3e-6, -2e-6, 5e-6])
+    found = find("arm_payload_offset").basis(stops_of(source, payload_kg=kg)) @ amount
+    q, expected = source.recording.joints, np.zeros_like(found)
+    for j, step in enumerate(1e-5 * np.eye(6)):
+        up, down = (source.rig.tree.place("arm_end", q + s).Ts_root_frame for s in (step, -step))
+        rise = ((up - down)[:, 2, :3] @ amount) / 2e-5
+        expected[:, j] = -kg * 9.80665 * rise
+    np.testing.assert_allclose(found, expected, atol=1e-10)
+    assert np.abs(found).max() > 1e-5
+
+
 def test_each_tip_has_a_payload_of_its_own(tmp_path):
     """What the right hand carries pulls at the torso and the right arm, by the height it rises."""
     rng = np.random.default_rng(2)
@@ -112,6 +126,13 @@ def test_each_tip_has_a_payload_of_its_own(tmp_path):
         np.testing.assert_allclose(found[:, j, j], expected, atol=1e-5)
         if rig.joint_names[j].startswith("left"):
             assert not found[:, j].any()
+    beside = find("arm_payload_offset")
+    names, moved = [p.name for p in beside.params(rig)], beside.basis(stops_view(source))
+    assert [n for n, any_ in zip(names, moved.any(axis=(0, 1)), strict=True) if any_] == [
+        "right_hand.x",
+        "right_hand.y",
+        "right_hand.z",
+    ]
     both = table.assign(**{"payload_kg": 1.0, "left_hand.payload_kg": 1.0})
     both.to_csv(tmp_path / "rec/stops.csv", index=False)
     with pytest.raises(InputError, match=r"payload_kg and left_hand\.payload_kg both say what"):
@@ -186,7 +207,7 @@ def test_the_mount_bends_down(source):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["arm_payload_sag", "arm_torque_sag"])
+@pytest.mark.parametrize("name", ["arm_payload_sag", "arm_payload_offset", "arm_torque_sag"])
 def test_a_joint_that_gives_way_is_named_by_what_it_gives_way_to(tmp_path, name):
     """Gravity alone explains most of a measured torque, and comes first until it is fitted."""
     spec = changed(load_spec("laser-tracker"), stops_per_location=6)
