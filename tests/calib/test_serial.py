@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from calib.diagnosis.chance.serial import FEWEST_IN_SERIES, p_serial
+from calib.diagnosis.chance.serial import FEWEST_IN_SERIES, drifting, p_serial
 from calib.diagnosis.search import search
 from calib.effects import find
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import stand_of
+from calib.runs.diagnose import diagnose, stand_of
 
 from . import arm_worlds
 
@@ -23,14 +24,13 @@ def quiet(*told):
     """Nothing."""
 
 
-def told(errors, time_s=None, effect="tracker_scatter", turn=None):
-    """The p-value for errors (K, r) of a body at the stops of a table, with the times of these; and
-    what turns (K, r, r) the rows' own axes to theirs."""
+def of_a_body(errors, time_s=None, turn=None):
+    """A problem and its blunders: errors (K, r) of a body at the stops of a table, with the times
+    of these; and what turns (K, r, r) the rows' own axes to theirs."""
     stops = STOPS[: len(errors)]
     time_s = np.full(len(stops), np.nan) if time_s is None else time_s  # as of no times
     recording = SimpleNamespace(stops=stops, time_s=time_s)
     problem = SimpleNamespace(sources=[SimpleNamespace(recording=recording)])
-    others = SimpleNamespace(problem=problem)
     known = 2.0 * np.eye(errors.shape[1])
     blunders = [
         SimpleNamespace(
@@ -46,7 +46,13 @@ def told(errors, time_s=None, effect="tracker_scatter", turn=None):
         )
         for k, (stop, error) in enumerate(zip(stops, errors, strict=True))
     ]
-    return p_serial(find(effect), others, blunders)
+    return problem, blunders
+
+
+def told(errors, time_s=None, effect="tracker_scatter", turn=None):
+    """The p-value of such errors."""
+    problem, blunders = of_a_body(errors, time_s, turn)
+    return p_serial(find(effect), SimpleNamespace(problem=problem), blunders)
 
 
 @pytest.mark.parametrize("count", [10, 20, 60])
@@ -169,3 +175,25 @@ def test_a_body_that_sat_elsewhere_for_a_while_is_not_called_random(tmp_path, ra
     assert ("not at random" in chance.sentence) is not random
     assert (chance.document(step=1)["p_serial"] < 0.01) is not random
     assert ("random as far as these data show" in chance.sentence) is random
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_noise_that_is_correlated_in_time_is_told(tmp_path, rho):
+    """As large as rig.yaml says, so that nothing scatters more than it should."""
+    rng = np.random.default_rng(78)
+    world = arm_worlds.bent(tmp_path / "rec", "puma560", rng)
+    read, white = world.draw(rng, 90), arm_worlds.noise(rng, 90)
+    errors = lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], white, axis=0)
+    T = world.seen(read) * arm_worlds.exp(errors)
+    arm_worlds.save(tmp_path / "rec", world, read, T, {}, 2e-5)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")
+    said = [s for s in diagnose(run, refits=False).sentences if "noise is correlated in time" in s]
+    assert bool(said) is (rho > 0)
+
+
+def test_a_step_that_was_found_may_be_one_of_such_noise():
+    white = np.random.default_rng(3).normal(size=(40, 3))
+    (sentence,) = drifting(*of_a_body(np.cumsum(white, axis=0)), ["a", "b"], told=False)
+    assert "err alike beside a and b, too" in sentence and "may look like a and b" in sentence
+    assert not list(drifting(*of_a_body(np.cumsum(white, axis=0)), [], told=True))
+    assert not list(drifting(*of_a_body(white), ["a"], told=False))

@@ -23,6 +23,7 @@ from calib.blunders.judged import Blunder
 from calib.blunders.others import Others
 from calib.blunders.shifts import beside_bodies, of_poses, told_by_stop
 from calib.diagnosis.chance.at_zero import AtZero
+from calib.diagnosis.chance.serial import ALPHA_SERIAL
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.problem import Problem
@@ -36,7 +37,6 @@ from calib.solve.components.told import LEAST_SD, Told, slices, told
 from calib.solve.estimate import Estimate
 
 ALPHA_SCATTER = LEVELS["scatter by chance"]
-ALPHA_SERIAL = 0.01  # share of random scatter that is said not to be: a choice, it names nothing
 # Members, or checks of a body's rows, below which nothing is said of their spread.
 FEWEST_MEMBERS = 4
 SCATTER_LOOKS = sum(effect.by_chance for effect in CATALOGUE)  # effects that are looked at

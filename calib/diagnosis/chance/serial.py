@@ -11,17 +11,21 @@ body's axes, and what is fixed to the tracker keeps it in the tracker's: both ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import special
 
+from calib.blunders.chance import at_least
 from calib.blunders.judged import Blunder
 from calib.blunders.others import Others
+from calib.diagnosis.suggest import all_of
 from calib.effects import Scatter, Site
+from calib.problem import Problem
 from calib.problem.model import labels
 from sensors.stops import in_time
 
+ALPHA_SERIAL = 0.01  # share of random errors that are said not to be: a choice, it names nothing
 FEWEST_IN_SERIES = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
 OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
 
@@ -34,20 +38,54 @@ def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
         others: all rows of the fit of that model.
         blunders: all groups of them, as `judge` has them.
     """
-    sources = others.problem.sources
-    named = zip(sources, labels(sources), strict=True)
-    turn = {
+    if effect.widens:
+        return _p_of_rows(others.problem, OF_ROWS.get(effect.site, ""), blunders)
+    turn = _turns(others.problem)
+    return _least(_of_values(effect, others, turn)) if effect.per == "stop" else 1.0
+
+
+def _turns(problem: Problem) -> dict[tuple[str, str], int]:
+    """Recording and stop -> its place in the order of time."""
+    named = zip(problem.sources, labels(problem.sources), strict=True)
+    return {
         (of, stop): at
         for source, of in named
         for at, stop in enumerate(in_time(source.recording.stops, source.recording.time_s))
     }
-    series: Iterator[np.ndarray] = iter(())
-    if effect.widens:
-        series = _of_rows(OF_ROWS.get(effect.site, ""), blunders, turn)
-    elif effect.per == "stop":
-        series = _of_values(effect, others, turn)
+
+
+def _least(series: Iterator[np.ndarray]) -> float:
+    """The least p-value of some series, how many there are being paid for."""
     p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_SERIES]
     return min(1.0, len(p) * min(p)) if p else 1.0
+
+
+def drifting(
+    problem: Problem, blunders: list[Blunder], names: Sequence[str], told: bool
+) -> Iterator[str]:
+    """What is said where tracked poses of stops that follow each other err alike beside all that a
+    search found; a sentence, or none.
+
+    Args:
+        problem: of the last fit.
+        blunders: of its rows, as `judge` has them.
+        names: of effects that go with time and were found; a step, say.
+        told: whether it is said of what scatters.
+    """
+    p = 1.0 if told else _p_of_rows(problem, "body", blunders)
+    if p < ALPHA_SERIAL:
+        looks = all_of(names)
+        mistaken = f"; steps and slopes of either may look like {looks}" if names else ""
+        yield (
+            "Tracked poses of stops that follow each other err alike "
+            f"{f'beside {looks}, too ' if names else ''}(p = {at_least(p):.1g}): something drifts, "
+            f"or the tracker's noise is correlated in time{mistaken}. Sigmas may be too small; "
+            "stops in another order, or longer holds, would tell."
+        )
+
+
+def _p_of_rows(problem: Problem, kind: str, blunders: list[Blunder]) -> float:
+    return _least(_of_rows(kind, blunders, _turns(problem)))
 
 
 def _of_rows(

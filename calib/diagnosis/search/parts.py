@@ -52,20 +52,22 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
         common: as of `ScoreTest.evidence`.
     """
     test = candidate.test
+    whole = Explained(test.statistic, test.dof)
     rig = look.stand.sources[0].rig
     of = np.array([rig.joint_of(param.name) for param in candidate.effect.params(rig)])
-    joints = [] if len(of) != len(test.columns) else np.unique(of[of != ""]).tolist()
-    found, count = [Explained(test.statistic, test.dof)], len(joints)
+    joints = np.unique(of[of != ""]).tolist()
+    if len(of) != len(test.columns) or len(joints) < 2:
+        return whole
     score = look.named.scores.score.copy()
     score[test.columns] = test.score  # in the shape that it was tested in
-    scores, taken = replace(look.named.scores, score=score), []
+    scores, count = replace(look.named.scores, score=score), len(joints)
+    found, taken = [whole], []
     while len(joints) > 1:
         price = float(np.log(comb(count, len(taken) + 1)))
         each = [_explained(scores, test.columns[np.isin(of, [*taken, j])], price) for j in joints]
         best = int(np.argmax([part.evidence(common) if part.dof else -np.inf for part in each]))
         found, taken = [*found, each[best]], [*taken, joints.pop(best)]
-    told = [part for part in found if part.dof] or found
-    return max(told, key=lambda part: part.evidence(common))
+    return max((p for p in found if p.dof), key=lambda part: part.evidence(common), default=whole)
 
 
 def _explained(scores: Scores, columns: np.ndarray, price: float) -> Explained:

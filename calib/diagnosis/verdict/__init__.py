@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ from calib.blunders.judged import Blunder
 from calib.blunders.lasting import lasting, told_once
 from calib.blunders.reach import FurthestMoved
 from calib.diagnosis.candidates import PoseShape, concerned, lacking
+from calib.diagnosis.chance.serial import ALPHA_SERIAL, drifting
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import Search
@@ -181,6 +182,7 @@ def conclude(
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
+    sentences += _drifts(found)
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,
@@ -223,6 +225,16 @@ def _caution(
     if rejected:
         leads = not formulas.formulas and verdict == UNNAMED and not rejected.explained
         sentences.insert(0 if leads else len(sentences), rejected.sentence)
+
+
+def _drifts(found: Search) -> Iterator[str]:
+    """What is said of tracked poses that err alike in time beside all that was found."""
+    last = found.beside or found.looks[-1]
+    if not last.stand.estimate.converged:
+        return iter(())
+    names = [step.effect.name for step in found.found if step.effect.goes_with_time]
+    told = any(each.p_serial < ALPHA_SERIAL for each in found.chance)
+    return drifting(last.stand.estimate.problem, last.blunders, names, told)
 
 
 def _disbelief(forbids: Sequence[str]) -> str:
