@@ -50,12 +50,14 @@ class Screen:
         common: the inflation that candidates have in common; 1 where all sigmas are right.
         candidates: best first.
         gauges: effects of which the data could show nothing.
+        at: effect's name -> its columns among the scores.
     """
 
     scores: Scores
     common: float
     candidates: Sequence[Candidate]
     gauges: Sequence[Effect]
+    at: Mapping[str, np.ndarray]
 
     def size_m(self, candidate: Candidate) -> float:
         """Root mean square of what it does to the ranges, all that the model absorbs included."""
@@ -121,7 +123,8 @@ def screen(
         )
         for effect, p, looks in found
     ]
-    return Screen(scores, common, sorted(candidates, key=lambda c: -c.evidence), gauges)
+    ranked = sorted(candidates, key=lambda c: -c.evidence)
+    return Screen(scores, common, ranked, gauges, at=columns)
 
 
 def _common(tests: Sequence[tuple[Effect, ScoreTest]]) -> float:

@@ -1,6 +1,8 @@
 """What a tracker errs by at a place: it moves all that is there, and the place is the model's."""
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -152,3 +154,25 @@ def test_noise_of_a_tracker_is_no_scale_of_it(tmp_path, arm):
     found = yaml.safe_load((added.folder / "solution.yaml").read_text(encoding="utf-8"))
     scale = found["effects"]["optitrack_scale"]
     assert abs(scale["estimate"][0]) < scale["sigma"][0] / 10
+
+
+def test_what_a_scale_would_change_unseen_is_what_it_does_change(tmp_path):
+    """An arm's lengths take in the whole of the tracker's scale: of those that move by most of
+    their sigmas the first is named, and by how many."""
+    (param,) = find("optitrack_scale").params(SimpleNamespace(tracker=True))
+    rng = np.random.default_rng(12)
+    world = arm_worlds.bent(tmp_path / "rec", "puma560", rng)
+    read, errors = world.draw(rng, 60), arm_worlds.exp(arm_worlds.noise(rng, 60))
+    lengths = []
+    for times in (1.0, 1.0 + param.sigma):
+        T = world.seen(read) * errors
+        seen = type(T).from_components(times * T.translation, T.rotation)
+        arm_worlds.save(tmp_path / "rec", world, read, seen, {}, 2e-5)
+        run = calibrate([tmp_path / "rec"], tmp_path / f"run{times}", hold_out="none")
+        lengths.append(run.solution.shared.effects["arm_link_length"])
+    sigma = np.maximum(lengths[0].sigma, 1e-9)  # 0 of joints that are drawn without a length
+    moved = np.abs(lengths[1].estimate - lengths[0].estimate) / sigma
+    said = [s for s in diagnose(run, refits=False).sentences if "Nothing here checks" in s]
+    (found,) = re.findall(r"would change arm_link_length\.(\S+) by (\d+) of its sigmas", said[0])
+    at = lengths[0].names.index(found[0])
+    assert float(found[1]) == pytest.approx(moved[at], rel=0.2) and moved[at] > 0.8 * moved.max()

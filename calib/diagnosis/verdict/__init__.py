@@ -24,6 +24,7 @@ from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
+    unchecked_scales,
     weighed,
 )
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
@@ -182,7 +183,7 @@ def conclude(
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
-    sentences += _drifts(found)
+    sentences += [*_drifts(found), *unchecked_scales(first)]
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,

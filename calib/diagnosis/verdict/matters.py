@@ -12,7 +12,7 @@ data ask for a more general form, and not for this name.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -24,6 +24,7 @@ from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import hangs_on, words
+from calib.effects import Site
 from calib.results.errors import Errors
 from calib.results.holdout import TAKEN_BACK, Fall
 
@@ -36,6 +37,7 @@ HELD_OUT_BY_CHANCE = 1.25
 # The same of models with something that scatters beyond its sigma: of 24 by that simulator the
 # largest was 1.31, with a mesh three times as bad as stated, whose errors steps only approach.
 HELD_OUT_BESIDE_SCATTER = 1.4
+UNCHECKED = 1.96  # sigmas: the 95 % interval
 # Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
 # rms more than half is left by an answer that explains less than that of the squares.
 ABSORBED = 0.7
@@ -112,15 +114,42 @@ class Consequences:
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
-        """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
-        linear = self.look.linear
-        _, model, taken = projection(linear, linear.candidates)
-        names = [n for n in self.look.stand.problem.calibration if n in linear.at]
-        ours = np.searchsorted(model, linear.among(names))
-        block = linear.information[np.ix_(model, model)]
-        scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
-        inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
-        return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
+        return absorbed_by(self.look)
+
+
+def absorbed_by(look: Look) -> tuple[np.ndarray, np.ndarray]:
+    """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
+    linear = look.linear
+    _, model, taken = projection(linear, linear.candidates)
+    names = [n for n in look.stand.problem.calibration if n in linear.at]
+    ours = np.searchsorted(model, linear.among(names))
+    block = linear.information[np.ix_(model, model)]
+    scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
+    inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
+    return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
+
+
+def unchecked_scales(look: Look) -> Iterator[str]:
+    """Of errors of an instrument by one number, a scale, that the model takes in wholly: what one
+    of usual size would change unseen; a sentence each, of those that would change a value by more
+    than its interval."""
+    of_instruments = {Site.TRACKER, Site.REFERENCE}
+    scales = [e for e in look.named.gauges if e.site in of_instruments and e.name in look.named.at]
+    scales = [e for e in scales if len(look.named.at[e.name]) == 1]
+    taken, sigma = absorbed_by(look) if scales else (np.zeros((0, 0)), np.zeros(0))
+    variables, linear = look.stand.problem.variables, look.linear
+    names = [n for n in look.stand.problem.calibration if n in linear.at]
+    keys = [key for n in names for key in variables[n].keys]
+    for effect in scales:
+        (param,) = effect.params(look.stand.sources[0].rig)
+        moved = np.abs(taken[:, look.named.at[effect.name][0]]) * param.sigma / sigma
+        most = int(np.argmax(moved)) if len(moved) else 0
+        if len(moved) and moved[most] > UNCHECKED:
+            yield (
+                f"Nothing here checks {effect.name}, as other parts of the model take it in: one "
+                f"of {param.sigma:g} would change {keys[most].name} by {moved[most]:.0f} of its "
+                "sigmas. A length that another instrument measured would tell."
+            )
 
 
 @dataclass(frozen=True)
