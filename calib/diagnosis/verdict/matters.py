@@ -37,7 +37,7 @@ HELD_OUT_BY_CHANCE = 1.25
 # The same of models with something that scatters beyond its sigma: of 24 by that simulator the
 # largest was 1.31, with a mesh three times as bad as stated, whose errors steps only approach.
 HELD_OUT_BESIDE_SCATTER = 1.4
-UNCHECKED = 1.96  # sigmas: the 95 % interval
+NOTABLE = 1.96  # sigmas: half a 95 % interval
 # Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
 # rms more than half is left by an answer that explains less than that of the squares.
 ABSORBED = 0.7
@@ -144,7 +144,7 @@ def unchecked_scales(look: Look) -> Iterator[str]:
         (param,) = effect.params(look.stand.sources[0].rig)
         moved = np.abs(taken[:, look.named.at[effect.name][0]]) * param.sigma / sigma
         most = int(np.argmax(moved)) if len(moved) else 0
-        if len(moved) and moved[most] > UNCHECKED:
+        if len(moved) and moved[most] > NOTABLE:
             yield (
                 f"Nothing here checks {effect.name}, as other parts of the model take it in: one "
                 f"of {param.sigma:g} would change {keys[most].name} by {moved[most]:.0f} of its "
