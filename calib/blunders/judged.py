@@ -118,7 +118,8 @@ class LeftOut:
 
     Args:
         blunder: as it stood out when it was left out.
-        rivals: groups that explain as much, and nothing once it is left out.
+        rivals: groups that explain as much, nothing once it is left out, and leave nothing of it if
+            they are left out instead.
         belongs: of a scan, the stop in whose place it fits.
         aside: whether the fit itself had set it aside.
     """

@@ -127,7 +127,7 @@ def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[
     M, u = own.T @ (raw - H) @ own, own.T @ b
     ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
     each = [np.arange(start, end) for start, end in pairwise(ends)]
-    limits = [limit for _, limit in some]
+    limits = np.array([limit for _, limit in some])
 
     def beside(i: int, kept: Sequence[int]) -> float:
         """What one explains that some others do not, beyond its limit."""
@@ -137,9 +137,21 @@ def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[
     kept: list[int] = []
     for i in range(len(some)):
         kept += [i] if beside(i, kept) > 0.0 else []
-    while kept and min(beyond := [beside(i, kept) for i in kept]) <= 0.0:
+    while kept and min(beyond := _beside_others(M, u, [each[i] for i in kept]) - limits[kept]) <= 0:
         del kept[int(np.argmin(beyond))]
     return [order[i] for i in kept]
+
+
+def _beside_others(M: np.ndarray, u: np.ndarray, each: Sequence[np.ndarray]) -> np.ndarray:
+    """What each of some shifts (G,) explains that all others of them do not. With ``C`` the inverse
+    of M, that is ``x_i^T C_ii^-1 x_i`` of ``x = C u``."""
+    at = np.concatenate(each)
+    size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
+    whiten, _ = whitening(M[np.ix_(at, at)], size)
+    C, x = whiten @ whiten.T, whiten @ (whiten.T @ u[at])
+    ends = np.cumsum([0, *map(len, each)]).tolist()
+    parts = [slice(*pair) for pair in pairwise(ends)]
+    return np.array([x[i] @ np.linalg.pinv(C[i, i], hermitian=True) @ x[i] for i in parts])
 
 
 def beside_bodies(others: Others, whose: Collection[Whose], wild: Collection[Group]) -> Sums:

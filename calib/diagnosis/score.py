@@ -281,7 +281,7 @@ def evidence(statistic: float, dof: int, common: float) -> float:
     return -log_tail(statistic / max(common, 1e-300), dof)
 
 
-def whitening(scores: Scores, columns: np.ndarray) -> np.ndarray:
+def independent(scores: Scores, columns: np.ndarray) -> np.ndarray:
     """What (q, r) makes the scores of some columns (q,) r independent ones of variance 1."""
     size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
@@ -293,7 +293,7 @@ def whitening(scores: Scores, columns: np.ndarray) -> np.ndarray:
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
     """Test the candidate of these columns."""
-    whiten, score = whitening(scores, columns), scores.score[columns]
+    whiten, score = independent(scores, columns), scores.score[columns]
     clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
     return ScoreTest(
         columns=columns,

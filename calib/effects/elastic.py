@@ -88,20 +88,21 @@ class ArmPayloadOffset(Effect):
     source = "stiffness of arms: Klimchik et al.; size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        several = len(rig.tips) > 1
-        names = (f"{tip}.{axis}" if several else axis for tip in rig.tips for axis in "xyz")
+        tips = rig.tips if "revolute" in rig.joint_kinds else ()
+        of = {tip: f"{tip}." if len(tips) > 1 else "" for tip in tips}
+        names = (f"{of[tip]}centre_{axis}" for tip in tips for axis in "xyz")  # no joint's name
         return tuple(Param(name, self.unit, 0.2 * SOFT) for name in names)
 
     def basis(self, view: View) -> np.ndarray:
         rig, payloads = view.rig, _payloads(view) or view[PAYLOAD]
         turning = np.array([kind == "revolute" for kind in rig.joint_kinds], float)
-        basis = np.zeros((len(view.joints), len(turning), 3 * len(rig.tips)))
+        basis = np.zeros((len(view.joints), len(turning), len(self.params(rig))))
 
         def torque(payload: Mass, centre_m: np.ndarray) -> np.ndarray:
             moved = replace(payload, centre_m=centre_m)
             return gravity_torque(rig.tree, [moved], view.joints, up(view))
 
-        for payload in payloads:
+        for payload in payloads if turning.any() else ():
             first = 3 * rig.tips.index(payload.frame)
             there = torque(payload, np.zeros(3))
             for k, axis in enumerate(np.eye(3)):

@@ -159,7 +159,11 @@ def _called(folder: Path, name: Path) -> Iterator[None]:
         yield
     except InputError as error:
         said = str(error).replace(str(folder), str(name))
-        as_made = " (so it would be imported; nothing was written)" if said != str(error) else ""
+        as_made = (
+            " (nothing was written; so the file would have been imported)"
+            if said != str(error)
+            else ""
+        )
         raise InputError(f"{said}{as_made}") from None
 
 

@@ -127,7 +127,8 @@ class Assembly:
         self.chi2 += float(sums.dense[TWIST, TWIST])
         seen = np.append(np.diag(sums.dense)[TWIST + 1 :], sums.own) > 0
         self.touched[sums.columns] |= seen
-        self.touched[sums.chain_columns] |= np.any(sums.chain != 0, axis=0)
+        # Twists are in m and rad, so rounding is less than in rows, which are in sigmas.
+        self.touched[sums.chain_columns] |= self.layout.moves(sums.chain, sums.chain_columns)
         if self.raw is not None:
             self.scans[sums.stop] = sums.alone()
         sigma, width = self.layout.sigma, sums.dense.shape[1] - TWIST

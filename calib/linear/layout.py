@@ -19,8 +19,8 @@ from calib.residuals.scan import ScanStop
 from calib.residuals.seen import BodiesTogether, SeenBody
 
 StopKey = tuple[object, int]
-# Of a row's sigma, by which a prior sigma of an unknown moves it: less than that is rounding, of
-# lengths of 1 m in sigmas of 1 um.
+# Least change of a whitened row by a prior sigma of an unknown: rounding of 1 m is 2e-16 m, which
+# in rows with a sigma of 1 um is 2e-10.
 ROUNDED_ROW = 1e-9
 
 

@@ -63,7 +63,8 @@ class Intervals:
             data sheets, and of an earlier run. How far residuals exceed their sigmas says nothing
             of these.
         wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
-        least: how many times wider all of them are at least, but for what is due to `given`.
+        least: how many times larger than their sigmas the errors of rows are, at least 1: all but
+            what is due to `given` is so much wider.
         cad: how many times wider than stated values of CAD scatter, at least 1.
     """
 
@@ -159,8 +160,7 @@ class Intervals:
         return found
 
     def at_least(self, wider: float, cad: float = 1.0) -> Intervals:
-        """With every interval at least so many times wider than the graph has it, but for what was
-        known before, and what CAD adds to each so many times larger."""
+        """With errors of rows that are so many times larger than their sigmas, and those of CAD."""
         return replace(self, least=wider, cad=cad)
 
     def document(self, names: Sequence[str]) -> dict[str, float | str]:

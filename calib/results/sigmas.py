@@ -15,7 +15,7 @@ from calib.results.intervals import Intervals, in_cad
 from calib.solve.estimate import Estimate
 from calib.solve.reweight import unweighted
 
-# Residuals so much larger than their sigmas are no accident: the result's sigmas are widened.
+# Residuals so much larger than their sigmas are no accident: what rows tell is less certain.
 TOLERATED = 1.2
 # Redundancy of all that CAD says of frames, below which nothing is told of how right it is: with
 # less than one row's worth, chance alone puts the ratio anywhere.
@@ -25,8 +25,8 @@ CHECKED = 1.0
 def widened(
     known: Intervals, estimate: Estimate, beams: Errors, elsewhere: Collection[str] = ()
 ) -> Intervals:
-    """Intervals, all of them wider where the residuals of an instrument exceed its sigmas, and what
-    CAD adds where frames are further from it than its sigmas allow; one wild row widens none.
+    """Intervals to which rows add more where the residuals of an instrument exceed its sigmas, and
+    CAD where frames are further from it than its sigmas allow; one wild row widens none.
 
     Args:
         known: the intervals.

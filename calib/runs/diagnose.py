@@ -20,7 +20,7 @@ from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
 from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, conclude
 from calib.diagnosis.verdict.known import by_name
-from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, weighed
+from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, unchecked, weighed
 from calib.diagnosis.verdict.names import believed
 from calib.diagnosis.verdict.sentences import BAD
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
@@ -87,8 +87,7 @@ def _found(
     if found.blunders and not (run.converged or found.looks[-1].stand.estimate.converged):
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
-    refits = refits and run.summary["rms_mm"]["held_out"] is not None
-    refits = refits and run.model["hold_out"] != "none"
+    refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
     between = list(moved_between(stand, found.looks[-1].stand, progress))
     if between:  # what moved once, between two recordings, seems to scatter, or contradicts all
@@ -123,6 +122,7 @@ def _found(
             *suspect,
             *result.sentences,
             *(told.uneven(last.blunders) if run.converged else ()),
+            *unchecked(found.looks[0], run.solution),
             *hardly_checked(unseen),
             *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),

@@ -39,7 +39,7 @@ class Explanation:
     Args:
         runs: from the first fit to the last, each grown from the one before.
         steps: per run what was added, dropped or left out, and its held-out error.
-        refused: effects that were found and did not lower the held-out error.
+        refused: effects that were found, and rivals of such, that did not lower the held-out error.
         diagnosis: of the last run.
         kept: files of the formulas that the last run has, for other recordings to use.
     """
@@ -72,9 +72,10 @@ def explain(
 
     What a mishap spoiled is left out first, as a rung of its own. What is found is added only if
     the held-out error falls, by a hundredth of what it has above the expected one or more, and
-    dropped again if later steps leave it nothing to lower. Residual structure is added as a
-    formula, which ``effects/NAME.yaml`` keeps for other recordings. Rungs that an interrupted call
-    has finished are taken up again.
+    dropped again if later steps leave it nothing to lower. In place of what is refused, its rivals
+    are tried; where the last name is refused, the diagnosis looks at held-out stops, too. Residual
+    structure is added as a formula, which ``effects/NAME.yaml`` keeps for other recordings. Rungs
+    that an interrupted call has finished are taken up again.
 
     Args:
         recordings: folder, or folders.
@@ -189,8 +190,12 @@ class _Climb:
         names = [*diagnosis.worth_adding, *self._formulas]
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
-        for name in names:  # or the first of those that nothing told it apart from
-            any(map(self._add, [name, *rivals.get(name, [])]))
+        for name in names:
+            if self._add(name):
+                continue
+            for rival in rivals.get(name, []):  # in its place, if stops bear that out
+                if self._add(rival, instead=True):
+                    break
         if len(self.runs) == before:
             return False
         for name in earlier:
@@ -205,8 +210,9 @@ class _Climb:
             if folder.name.isdigit() and int(folder.name) >= len(self.runs):
                 outputs.remove(folder)
 
-    def _add(self, name: str) -> bool:
-        """Add an effect, if the error falls with it. Whether it is in the model."""
+    def _add(self, name: str, instead: bool = False) -> bool:
+        """Add an effect, if the error falls with it; by more than chance, if `instead` of another.
+        Whether it is in the model."""
         described = self._formulas.get(name)
         if described is not None:
             effects = (read(described, self.run.folder / DIAGNOSIS, {}),)
@@ -214,7 +220,7 @@ class _Climb:
             effects = load_effects((name,), own=() if is_known(name) else self._own)
         families = {effect.family for effect in self._model.effects}
         if name not in self.refused and effects[0].family not in families:
-            self._try(self._model.plus(effects), [name], [])
+            self._try(self._model.plus(effects), [name], [], instead)
         return any(effect.family == effects[0].family for effect in self._model.effects)
 
     def _leave_out(self, tokens: list[str]) -> None:
@@ -227,7 +233,9 @@ class _Climb:
     def _model(self) -> Model:
         return model_of(self.run)
 
-    def _try(self, model: Model, added: list[str], dropped: list[str]) -> None:
+    def _try(
+        self, model: Model, added: list[str], dropped: list[str], instead: bool = False
+    ) -> None:
         folder = self._next()
         run = self._finished(folder, model, self.run)
         if run is None:
@@ -235,7 +243,8 @@ class _Climb:
         # What is drawn anew by chance tells nothing of a stop that was left out.
         chance = any(effect.by_chance for effect in model.effects if effect.name in added)
         falls = _falls(self.run, run, LEAST_FALL if added else 0.0)
-        if any(step["added"] for step in self.steps) and self._general.intersection(added):
+        later = any(step["added"] for step in self.steps)
+        if instead or (later and self._general.intersection(added)):
             falls = falls and not _by_chance(self.run, run)
         if run.converged and (chance or falls):
             self._keep(run, added, dropped)

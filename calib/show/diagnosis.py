@@ -64,9 +64,7 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
     if tied:
         print_pairs(console, "not distinguishable on these data", tied)
     if diagnosis.plan:
-        print_command(
-            console, diagnosis.plan, "Stops that separate what these do not are planned by:"
-        )
+        print_command(console, diagnosis.plan, "Stops that tell such effects apart are planned by:")
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if adequate:

@@ -11,6 +11,7 @@ import pytest
 
 from calib.diagnosis.candidates import concerned
 from calib.effects import CATALOGUE
+from calib.linear.layout import Layout
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -218,8 +219,8 @@ def nearest_poses(folder, to, count):
 
 
 def test_a_small_box_is_warned_of_however_much_wider_intervals_are(shared, tmp_path):
-    """An effect is missing, so that rows err together and every sigma is widened: each parameter's
-    own factor took from 4.5 to 1.6 how much worse the place is known elsewhere."""
+    """An effect is missing, so that rows err together and what they tell is widened: each
+    parameter's own factor took from 4.5 to 1.6 how much worse the place is known elsewhere."""
     folder = nearest_poses(shared / "recordings/arm_payload", tmp_path / "rec", 20)
     (checked,) = check(folder).predicted
     run = calibrate([folder], tmp_path / "run", hold_out="none")
@@ -302,3 +303,11 @@ def test_a_scan_whose_joints_are_left_out_is_placed_by_what_else_there_is(tmp_pa
     assert without.count == pytest.approx(whole.count, rel=0.05)
     assert without.floor_mm == pytest.approx(whole.floor_mm, rel=0.2)
     assert without.rms_mm == pytest.approx(whole.rms_mm, rel=0.2)
+
+
+def test_what_depends_on_a_parameter_by_rounding_alone_does_not_depend_on_it(source):
+    """Whatever else a derivative is: told in sigmas of the row and of what was known before."""
+    layout = Layout.of(build([source], SMALL))
+    columns = np.array([layout.at["arm_link_length"].start, layout.at["arm_joint_offset"].start])
+    by_sigma = np.array([[2e-10, 1e-3], [0.0, 0.0]])
+    assert layout.moves(by_sigma / layout.sigma[columns], columns).tolist() == [False, True]

@@ -129,9 +129,9 @@ def test_each_tip_has_a_payload_of_its_own(tmp_path):
     beside = find("arm_payload_offset")
     names, moved = [p.name for p in beside.params(rig)], beside.basis(stops_view(source))
     assert [n for n, any_ in zip(names, moved.any(axis=(0, 1)), strict=True) if any_] == [
-        "right_hand.x",
-        "right_hand.y",
-        "right_hand.z",
+        "right_hand.centre_x",
+        "right_hand.centre_y",
+        "right_hand.centre_z",
     ]
     both = table.assign(**{"payload_kg": 1.0, "left_hand.payload_kg": 1.0})
     both.to_csv(tmp_path / "rec/stops.csv", index=False)

@@ -190,12 +190,12 @@ def test_a_plan_has_its_way_and_says_for_what_the_arm_is_taken(run, rigcal, tmp_
     path.write_text(path.read_text().replace("</link>", f"{mesh}</link>", 1))
     calib.fit([tmp_path / "rec"], tmp_path / "run", hold_out="none")
     words = ["plan", tmp_path / "run", "--for", "all", "--candidates", 40, "--stops", 4]
-    code, out, _ = rigcal(*words, "-o", tmp_path / "plan")
+    code, out, _ = rigcal(*words, "-o", tmp_path / "v1.2-plan")  # as of a run v1.2
     told = " ".join(out.split())
     assert code == 0 and "Taken for tubes, as their shapes are missing: " in told
     assert "the recording has no 'a.stl'" in told
     assert "clear of the arm's own links and room" in told or "goes by another pose" in told
-    way, stops = (pd.read_csv(tmp_path / "plan" / f"{name}.csv") for name in ("way", "stops"))
+    way, stops = (pd.read_csv(tmp_path / "v1.2-plan" / f"{name}.csv") for name in ("way", "stops"))
     at = way[way.stop.notna()]
     assert at.stop.tolist() == [1, 2, 3, 4]
     np.testing.assert_allclose(at[JOINTS], stops[JOINTS])

@@ -60,9 +60,7 @@ def _least(series: Iterator[np.ndarray]) -> float:
     return min(1.0, len(p) * min(p)) if p else 1.0
 
 
-def drifting(
-    problem: Problem, blunders: list[Blunder], names: Sequence[str], told: bool
-) -> Iterator[str]:
+def drifting(problem: Problem, blunders: list[Blunder], names: Sequence[str]) -> Iterator[str]:
     """What is said where tracked poses of stops that follow each other err alike beside all that a
     search found; a sentence, or none.
 
@@ -70,17 +68,19 @@ def drifting(
         problem: of the last fit.
         blunders: of its rows, as `judge` has them.
         names: of effects that go with time and were found; a step, say.
-        told: whether it is said of what scatters.
     """
-    p = 1.0 if told else _p_of_rows(problem, "body", blunders)
+    p = _p_of_rows(problem, "body", blunders)
     if p < ALPHA_SERIAL:
         looks = all_of(names)
-        mistaken = f"; steps and slopes of either may look like {looks}" if names else ""
+        beside, mistaken = "", ""
+        if names:
+            beside = f"even with {looks} in the model "
+            mistaken = f" Noise that is correlated in time can look like {looks}."
         yield (
-            "Tracked poses of stops that follow each other err alike "
-            f"{f'beside {looks}, too ' if names else ''}(p = {at_least(p):.1g}): something drifts, "
-            f"or the tracker's noise is correlated in time{mistaken}. Sigmas may be too small; "
-            "stops in another order, or longer holds, would tell."
+            f"Tracked poses of stops that follow each other err alike {beside}(p = "
+            f"{at_least(p):.1g}): something drifts, the tracker's noise is correlated in time, or "
+            f"the error goes with the pose and poses follow a path.{mistaken} Sigmas may be too "
+            "small; the same stops in a random order would tell."
         )
 
 

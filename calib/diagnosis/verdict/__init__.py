@@ -24,7 +24,6 @@ from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
-    unchecked_scales,
     weighed,
 )
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
@@ -40,6 +39,7 @@ VERDICTS = {
     UNNAMED: "structure that no effect explains",
     BAD: "something in the recording is wrong",
 }
+OF_TIME = frozenset({"time_s", "elapsed_s"})
 ABSORBED_BY_MODEL = "not identifiable: absorbed by the model"
 
 
@@ -183,7 +183,7 @@ def conclude(
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
     sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
-    sentences += [*_drifts(found), *unchecked_scales(first)]
+    sentences += _drifts(found, unexplained)
     return Diagnosis(
         verdict=verdict,
         sentences=sentences,
@@ -228,14 +228,16 @@ def _caution(
         sentences.insert(0 if leads else len(sentences), rejected.sentence)
 
 
-def _drifts(found: Search) -> Iterator[str]:
-    """What is said of tracked poses that err alike in time beside all that was found."""
+def _drifts(found: Search, unexplained: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """What is said of tracked poses that err alike in time beside all that was found: of structure
+    over the pose as little as of scatter that says it itself, but where a name goes with time."""
     last = found.beside or found.looks[-1]
-    if not last.stand.estimate.converged:
-        return iter(())
     names = [step.effect.name for step in found.found if step.effect.goes_with_time]
+    of_time = {c for each in unexplained for c in each["covariates"]} <= OF_TIME
     told = any(each.p_serial < ALPHA_SERIAL for each in found.chance)
-    return drifting(last.stand.estimate.problem, last.blunders, names, told)
+    if not last.stand.estimate.converged or told or not (names or of_time):
+        return iter(())
+    return drifting(last.stand.estimate.problem, last.blunders, names)
 
 
 def _disbelief(forbids: Sequence[str]) -> str:

@@ -27,6 +27,7 @@ from calib.diagnosis.suggest import hangs_on, words
 from calib.effects import Site
 from calib.results.errors import Errors
 from calib.results.holdout import TAKEN_BACK, Fall
+from calib.results.solution import Solution
 
 # Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
 # than two folds of one recording differ by, and half a sigma widens an interval by a tenth.
@@ -114,41 +115,53 @@ class Consequences:
 
     @cached_property
     def _projected(self) -> tuple[np.ndarray, np.ndarray]:
-        return absorbed_by(self.look)
+        """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
+        linear = self.look.linear
+        _, model, taken = projection(linear, linear.candidates)
+        ours = np.searchsorted(model, linear.among(_calibration(self.look)))
+        block = linear.information[np.ix_(model, model)]
+        scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
+        inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
+        return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
 
 
-def absorbed_by(look: Look) -> tuple[np.ndarray, np.ndarray]:
-    """How much (C, Q) of each candidate every value of the calibration absorbs, and sigmas."""
-    linear = look.linear
-    _, model, taken = projection(linear, linear.candidates)
-    names = [n for n in look.stand.problem.calibration if n in linear.at]
-    ours = np.searchsorted(model, linear.among(names))
-    block = linear.information[np.ix_(model, model)]
-    scale = np.sqrt(np.maximum(np.diag(block), 1e-300))
-    inverse = np.linalg.inv(block / np.outer(scale, scale) + 1e-13 * np.eye(len(model)))
-    return taken[ours], np.sqrt(np.diag(inverse)[ours]) / scale[ours]
+def _calibration(look: Look) -> list[str]:
+    """Unknowns of the calibration that the rows of a look depend on."""
+    return [name for name in look.stand.problem.calibration if name in look.linear.at]
 
 
-def unchecked_scales(look: Look) -> Iterator[str]:
+def unchecked(look: Look, solution: Solution) -> Iterator[str]:
     """Of errors of an instrument by one number, a scale, that the model takes in wholly: what one
     of usual size would change unseen; a sentence each, of those that would change a value by more
-    than its interval."""
-    of_instruments = {Site.TRACKER, Site.REFERENCE}
-    scales = [e for e in look.named.gauges if e.site in of_instruments and e.name in look.named.at]
-    scales = [e for e in scales if len(look.named.at[e.name]) == 1]
-    taken, sigma = absorbed_by(look) if scales else (np.zeros((0, 0)), np.zeros(0))
-    variables, linear = look.stand.problem.variables, look.linear
-    names = [n for n in look.stand.problem.calibration if n in linear.at]
-    keys = [key for n in names for key in variables[n].keys]
+    than its interval.
+
+    Args:
+        look: at the fit as it was.
+        solution: of its run.
+    """
+    of_instruments, at = {Site.TRACKER, Site.REFERENCE}, look.named.at
+    scales = [e for e in look.named.gauges if e.site in of_instruments and e.name in at]
+    scales = [e for e in scales if len(at[e.name]) == 1]
+    if not scales:
+        return
+    linear, names = look.linear, _calibration(look)
+    _, model, taken = projection(linear, linear.candidates)
+    keys = [key for name in names for key in look.stand.problem.variables[name].keys]
+    reported = dict(zip(solution.keys, np.sqrt(np.diag(solution.covariance)), strict=True))
+    here = [i for i, key in enumerate(keys) if reported.get(key, 0.0) > 0.0]
+    keys, taken = [keys[i] for i in here], taken[np.searchsorted(model, linear.among(names))][here]
+    sigma = np.array([reported[key] for key in keys])
     for effect in scales:
-        (param,) = effect.params(look.stand.sources[0].rig)
-        moved = np.abs(taken[:, look.named.at[effect.name][0]]) * param.sigma / sigma
-        most = int(np.argmax(moved)) if len(moved) else 0
-        if len(moved) and moved[most] > NOTABLE:
+        every = (source.rig for source in look.stand.sources)
+        param = next(param for rig in every for param in effect.params(rig))
+        moved = np.abs(taken[:, at[effect.name][0]]) * param.sigma / sigma
+        most = int(np.argmax(moved)) if len(moved) else -1
+        if most >= 0 and moved[most] > NOTABLE:
             yield (
-                f"Nothing here checks {effect.name}, as other parts of the model take it in: one "
-                f"of {param.sigma:g} would change {keys[most].name} by {moved[most]:.0f} of its "
-                "sigmas. A length that another instrument measured would tell."
+                f"Nothing here checks {effect.name}, as other parts of the model take it in: a "
+                f"scale error of {param.sigma:g} would change {keys[most].name} by "
+                f"{moved[most]:.0f} of its sigmas. A length that another instrument measured would "
+                "tell."
             )
 
 

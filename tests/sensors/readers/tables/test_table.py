@@ -110,6 +110,7 @@ def test_rows_out_of_order_are_put_in_order_and_keep_their_number(tmp_path):
     ("columns", "options", "flag"),
     [
         ({"j1": 90.0 * XYZ[:, 0], "j2": XYZ[:, 1]}, {}, "--angle-unit deg"),
+        ({"j1": 90.0 * XYZ[:, 0], "j2": XYZ[:, 1]}, {}, r"--column 'j1=j1\[deg\]'"),
         ({f"cup.{a}": 900 * XYZ[:, k] for k, a in enumerate("xyz")}, {}, "--length-unit mm"),
         ({"j1": XYZ[:, 0], "q2": XYZ[:, 1]}, {}, "--column j2=THEIRS"),
         ({"time_s": 0.5 * np.arange(20), "j1": XYZ[:, 0], "j2": XYZ[:, 1]}, {}, "--rows"),
