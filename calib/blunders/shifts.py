@@ -127,16 +127,10 @@ def standing_alone(others: Others, some: Sequence[tuple[Shift, float]]) -> list[
     M, u = own.T @ (raw - H) @ own, own.T @ b
     ends = np.cumsum([0, *(rows.groups[g].shape[1] for g, rows in zip(order, every, strict=True))])
     each = [np.arange(start, end) for start, end in pairwise(ends)]
-    limits = np.array([limit for _, limit in some])
-
-    def beside(i: int, kept: Sequence[int]) -> float:
-        """What one explains that some others do not, beyond its limit."""
-        gone = np.concatenate([np.zeros(0, int), *(each[k] for k in kept if k != i)])
-        return _statistic(M, u, np.append(gone, each[i])) - _statistic(M, u, gone) - limits[i]
-
-    kept: list[int] = []
-    for i in range(len(some)):
-        kept += [i] if beside(i, kept) > 0.0 else []
+    limits, gone, kept = np.array([limit for _, limit in some]), np.zeros(0, int), []
+    for i, at in enumerate(each):
+        if _statistic(M, u, np.append(gone, at)) - _statistic(M, u, gone) > limits[i]:
+            gone, kept = np.append(gone, at), [*kept, i]
     while kept and min(beyond := _beside_others(M, u, [each[i] for i in kept]) - limits[kept]) <= 0:
         del kept[int(np.argmin(beyond))]
     return [order[i] for i in kept]
@@ -146,8 +140,7 @@ def _beside_others(M: np.ndarray, u: np.ndarray, each: Sequence[np.ndarray]) -> 
     """What each of some shifts (G,) explains that all others of them do not. With ``C`` the inverse
     of M, that is ``x_i^T C_ii^-1 x_i`` of ``x = C u``."""
     at = np.concatenate(each)
-    size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
-    whiten, _ = whitening(M[np.ix_(at, at)], size)
+    whiten = _whitening_of(M, at)
     C, x = whiten @ whiten.T, whiten @ (whiten.T @ u[at])
     ends = np.cumsum([0, *map(len, each)]).tolist()
     parts = [slice(*pair) for pair in pairwise(ends)]
@@ -225,9 +218,12 @@ def _statistic(M: np.ndarray, u: np.ndarray, at: np.ndarray) -> float:
     """``u^T M^-1 u`` of some shifts, in the directions that anything contradicts."""
     if not len(at):
         return 0.0
-    size = np.sqrt(np.maximum(np.diag(M)[at], 1e-300))
-    whiten, _ = whitening(M[np.ix_(at, at)], size)
-    return float(np.sum(np.square(whiten.T @ u[at])))
+    return float(np.sum(np.square(_whitening_of(M, at).T @ u[at])))
+
+
+def _whitening_of(M: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """`whitening` of some shifts, each in units of its own sigma."""
+    return whitening(M[np.ix_(at, at)], np.sqrt(np.maximum(np.diag(M)[at], 1e-300)))[0]
 
 
 def _of_sums(some: Alike, groups: Sequence[Group], squares: Sequence[Squares]) -> Iterator[Shift]:

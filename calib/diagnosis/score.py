@@ -281,26 +281,28 @@ def evidence(statistic: float, dof: int, common: float) -> float:
     return -log_tail(statistic / max(common, 1e-300), dof)
 
 
-def independent(scores: Scores, columns: np.ndarray) -> np.ndarray:
-    """What (q, r) makes the scores of some columns (q,) r independent ones of variance 1."""
+def explained(scores: Scores, columns: np.ndarray) -> tuple[np.ndarray, float]:
+    """What (q, r) makes the scores of some columns (q,) r independent ones of variance 1; and the
+    sum of the squares of these."""
     size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
     block = scores.information[np.ix_(columns, columns)]
     values, axes = np.linalg.eigh(block / np.outer(size, size))
     seen = values > GAUGE
-    return (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
+    whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
+    return whiten, float(np.sum(np.square(whiten.T @ scores.score[columns])))
 
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
     """Test the candidate of these columns."""
-    whiten, score = independent(scores, columns), scores.score[columns]
+    whiten, statistic = explained(scores, columns)
     clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
     return ScoreTest(
         columns=columns,
-        statistic=float(np.sum(np.square(whiten.T @ score))),
+        statistic=statistic,
         whiten=whiten,
         chances=(by_signs([way @ whiten for way in scores.ways(columns)], clusters, scores.spent),),
         clusters=clusters,
-        score=score,
+        score=scores.score[columns],
         spent=scores.spent,
     )

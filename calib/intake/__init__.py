@@ -160,9 +160,7 @@ def _called(folder: Path, name: Path) -> Iterator[None]:
     except InputError as error:
         said = str(error).replace(str(folder), str(name))
         as_made = (
-            " (nothing was written; so the file would have been imported)"
-            if said != str(error)
-            else ""
+            " (of what would have been imported; nothing was written)" if said != str(error) else ""
         )
         raise InputError(f"{said}{as_made}") from None
 

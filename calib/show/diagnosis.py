@@ -64,7 +64,7 @@ def _print_tables(console: Console, diagnosis: Diagnosis, residual: str) -> None
     if tied:
         print_pairs(console, "not distinguishable on these data", tied)
     if diagnosis.plan:
-        print_command(console, diagnosis.plan, "Stops that tell such effects apart are planned by:")
+        print_command(console, diagnosis.plan, "Stops that would tell more are planned by:")
     if diagnosis.unexplained:
         console.print(unexplained_table(diagnosis.unexplained[:LEADING], residual))
     if adequate:
@@ -206,7 +206,7 @@ def _print_weak(console: Console, directions: Sequence[Mapping[str, Any]]) -> No
         rows.append((f"{', '.join(d['parameters'])}{sigma}", d["needs"]))
     if rows:
         print_pairs(
-            console, "weakly determined (an angle: at 1 m), and what would determine it", rows
+            console, "weakly determined (angles as mm at 1 m), and what would determine it", rows
         )
 
 

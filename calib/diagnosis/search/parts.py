@@ -12,7 +12,7 @@ from math import comb
 
 import numpy as np
 
-from calib.diagnosis.score import Scores, evidence, independent
+from calib.diagnosis.score import Scores, evidence, explained
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.stand import Look
 
@@ -72,6 +72,5 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
 
 def _explained(scores: Scores, columns: np.ndarray, price: float) -> Explained:
     """What some columns explain."""
-    whiten = independent(scores, columns)
-    statistic = float(np.sum(np.square(whiten.T @ scores.score[columns])))
+    whiten, statistic = explained(scores, columns)
     return Explained(statistic, whiten.shape[1], price)

@@ -151,12 +151,12 @@ def unchecked(look: Look, solution: Solution) -> Iterator[str]:
     here = [i for i, key in enumerate(keys) if reported.get(key, 0.0) > 0.0]
     keys, taken = [keys[i] for i in here], taken[np.searchsorted(model, linear.among(names))][here]
     sigma = np.array([reported[key] for key in keys])
-    for effect in scales:
+    for effect in scales if keys else ():
         every = (source.rig for source in look.stand.sources)
         param = next(param for rig in every for param in effect.params(rig))
         moved = np.abs(taken[:, at[effect.name][0]]) * param.sigma / sigma
-        most = int(np.argmax(moved)) if len(moved) else -1
-        if most >= 0 and moved[most] > NOTABLE:
+        most = int(np.argmax(moved))
+        if moved[most] > NOTABLE:
             yield (
                 f"Nothing here checks {effect.name}, as other parts of the model take it in: a "
                 f"scale error of {param.sigma:g} would change {keys[most].name} by "
