@@ -10,6 +10,7 @@ import numpy as np
 from calib.effects import Effect, FrameOffset
 from calib.forward import NOISE, Stops
 from calib.linear.layout import Layout, key_of
+from calib.linear.own import body_rows
 from calib.linear.system import Linearisation, Values
 from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
@@ -115,9 +116,9 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
     plain = [unweighted(b) for b in blocks]
     weight = {id(p): b.weight for p, b in zip(plain, blocks, strict=True)}
     for together in BodiesTogether.of(plain):
-        every = together.rows(whole.values)
-        for block, (residual, A, names) in zip(together.blocks, every, strict=True):
-            per, columns = len(block.axes), layout.columns(names)
+        every = zip(*body_rows(layout, together, whole.values), strict=True)
+        for block, (A, b, columns) in zip(together.blocks, every, strict=True):
+            per = len(block.axes)
             weights = weight[id(block)]
             weights = np.ones(len(block.measured)) if weights is None else weights
             for k, group in enumerate(block.groups):
@@ -125,7 +126,7 @@ def _bodies(whole: Linearisation) -> Iterator[GroupRows]:
                 yield GroupRows(
                     A=A[here],
                     columns=columns,
-                    b=-residual[here],
+                    b=b[here],
                     weight=np.full(per, weights[k]),
                     sigma=block.sigma,
                     axes=block.axes,

@@ -23,7 +23,7 @@ from scipy.linalg import cho_factor, cho_solve
 from calib.linear.cluster_sums import ALONE
 from calib.linear.clusters import ClusteredRows
 from calib.linear.layout import Layout, positions
-from calib.linear.linearise import prior_rows
+from calib.linear.own import OwnRows, priors
 from calib.problem.unknowns import Role
 
 Values = Mapping[str, np.ndarray]
@@ -55,20 +55,22 @@ class Leverage:
         if layout.scanned:
             return cls((), np.zeros((0, 0)))
         names = [name for name in layout.outer() if name not in layout.unbounded]
-        at, start = positions(layout.size, layout.kept)[layout.columns(names)], 0
+        at = positions(layout.size, layout.kept)[layout.columns(names)]
         block = information[np.ix_(at, at)]
-        priors = prior_rows(layout, names, values)
-        for name in names:
-            end = start + layout.unknowns[name].dim
-            if layout.unknowns[name].role is Role.CALIBRATION:
-                A = priors[name].A * layout.sigma[layout.at[name]]
-                block[start:end, start:end] += (1.0 - widened**-2.0) * A.T @ A
-            start = end
+        ends = np.cumsum([layout.unknowns[name].dim for name in names])
+        hardware = [name for name in names if layout.unknowns[name].role is Role.CALIBRATION]
+        for some, known, _ in priors(layout, hardware, values):
+            scaled = known * layout.sigma[layout.columns_of_each(some)][:, None]
+            for name, A in zip(some, scaled, strict=True):
+                end = ends[names.index(name)]
+                block[end - len(A) : end, end - len(A) : end] += (1.0 - widened**-2.0) * A.T @ A
         unit = layout.sigma[layout.columns(names)]
         C = cho_solve(cho_factor(block), np.eye(len(block))) * np.outer(unit, unit)
         return cls(names, C)
 
-    def grown(self, rows: Sequence[ClusteredRows], layout: Layout) -> list[ClusteredRows]:
+    def grown(
+        self, rows: Sequence[ClusteredRows | OwnRows], layout: Layout
+    ) -> list[ClusteredRows | OwnRows]:
         """The same rows, whitened and all but those of beams, with the residuals of each stop as
         large as errors are."""
         if not self.names:
@@ -84,23 +86,28 @@ class Leverage:
             at = order[first[count == size][:, None] + np.arange(size)]
             e[at] = _grown(e[at], kept[at], own[at], self.covariance)
         pairs = zip(rows, ends, ends[1:], strict=False)
-        return [some._replace(b=e[start:end]) for some, start, end in pairs]
+        return [some.with_residuals(e[start:end]) for some, start, end in pairs]
 
     def _derivatives(
-        self, rows: Sequence[ClusteredRows], ends: np.ndarray, layout: Layout
+        self, rows: Sequence[ClusteredRows | OwnRows], ends: np.ndarray, layout: Layout
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives (R, S) of all rows by what stops share, and (R, O) by what each has alone."""
         shared = positions(layout.size, layout.columns(self.names))
         alone = np.full(layout.size, -1)
         for columns in layout.own.values():
             alone[columns] = np.arange(len(columns))
-        out = [np.zeros((ends[-1], int(at.max(initial=-1)) + 1)) for at in (shared, alone)]
+        kept, own = (np.zeros((ends[-1], int(at.max(initial=-1)) + 1)) for at in (shared, alone))
         for some, start, end in zip(rows, ends, ends[1:], strict=False):
-            for whole, at in zip(out, (shared, alone), strict=True):
-                to = at[some.columns]
-                if (to >= 0).any():
-                    whole[start:end, to[to >= 0]] = some.A[:, to >= 0]
-        return out[0], out[1]
+            if isinstance(some, OwnRows):
+                A, columns = some.shared.reshape(end - start, -1), some.shared_columns
+                at = np.arange(start, end).reshape(len(some.stops), -1)[:, :, None]
+                own[at, alone[some.own_columns][:, None]] = some.own
+            else:
+                A, columns = some.A, some.columns
+            to = shared[columns]
+            if (to >= 0).any():
+                kept[start:end, to[to >= 0]] = A[:, to >= 0]
+        return kept, own
 
 
 def _grown(e: np.ndarray, kept: np.ndarray, own: np.ndarray, C: np.ndarray) -> np.ndarray:

@@ -14,15 +14,15 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
-from calib.linear.assembly import OwnRows
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
-from calib.linear.linearise import linearise, own_rows
+from calib.linear.linearise import linearise
+from calib.linear.own import OwnRows, own_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
-from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
+from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import Graph
@@ -77,7 +77,7 @@ class Linear:
     raw: np.ndarray | None
     gradient: csr_array
     score: np.ndarray
-    others: Sequence[ClusteredRows]
+    others: Sequence[ClusteredRows | OwnRows]
     stop: np.ndarray
     place: np.ndarray
     places: dict[object, int]
@@ -112,9 +112,8 @@ def rows_along(
         away: (U, r) the directions.
         progress: called with how many stops are done, and of how many.
     """
-    every = np.arange(away.shape[1])
     for rows in linear.others:
-        yield rows._replace(A=rows.A @ away[rows.columns], columns=every)
+        yield rows.along(away)
     if not wide.scans:
         return
     wide, values = beside(wide, estimate)
@@ -130,8 +129,9 @@ def rows_along(
         progress=progress,
     )
     most, cells = None, np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
-    if cells * len(every) ** 2 > JUDGING_NUMBERS:
-        most = max(DRAWN_NUMBERS // (len(every) * len(wide.scans)), FEWEST_DRAWN)
+    count = away.shape[1]
+    if cells * count**2 > JUDGING_NUMBERS:
+        most = max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN)
     yield from beams.rows(most)
 
 
@@ -172,7 +172,7 @@ def linearise_with(
     at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients, own))
     alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
-    for rows in others:
+    for rows in (r for r in others if isinstance(r, ClusteredRows)):
         if (at[rows.columns] >= 0).all():  # the others are in the linearisation
             alike.setdefault(rows.columns.tobytes(), []).append(rows)
     for some in alike.values():
@@ -183,8 +183,8 @@ def linearise_with(
     grown = Leverage.of(information, layout, values, WIDENED).grown(others, layout)
     more = np.zeros(layout.size)
     for rows, larger in zip(others, grown, strict=True):
-        gradients.add_rows(larger)
-        more[rows.columns] += rows.A.T @ (larger.b - rows.b)
+        gradients.add_entries(*larger.gradients())
+        rows.add_gradient(larger.b - rows.b, more)
     for each in (information, raw):  # in their place: there may be thousands of columns
         each /= layout.sigma[layout.kept]
         each /= layout.sigma[layout.kept, None]
@@ -212,11 +212,11 @@ def other_rows(
     layout: Layout,
     values: Mapping[str, np.ndarray],
     places: Gradients,
-    own: Mapping[int, Sequence[OwnRows]],
-) -> Iterator[ClusteredRows]:
+    own: Sequence[OwnRows],
+) -> Iterator[ClusteredRows | OwnRows]:
     """Rows of tracked bodies, targets and priors, with the stop and place that each errs with: each
     target, and each row of a prior that no stop has for itself, is a place of its own."""
-    yield from of_stops(own)
+    yield from own
     for cells, rows in of_cells(wide, layout, values):
         yield rows._replace(place=places.numbers(cells.room, cells.surface))
     graph = Graph(list(layout.outer().values()), layout.others, layout.unbounded)

@@ -6,15 +6,16 @@ grows with the number of stops, and most of the work is in products of large mat
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsyrk
 
-from calib.linear.clusters import ClusteredRows
 from calib.linear.elimination import Eliminated, eliminate, square
 from calib.linear.layout import Layout, positions
+from calib.linear.own import OwnRows, alike
 from calib.linear.rows import TWIST, OwnSums, StopSums
 from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
@@ -23,28 +24,6 @@ from calib.residuals.compiled import add_at, add_sparse
 # Most entries of the rows of stops that wait, over all columns: bounds the memory.
 WAITING_ENTRIES = 2_000_000
 STOPS_TOGETHER = 256  # without beams, whose rows are multiplied at once, likewise
-
-
-@dataclass(frozen=True)
-class OwnRows:
-    """Whitened rows that are no beams: of a tracked body, of a prior, or of a hold's scatter.
-
-    Args:
-        A: (m, n) derivatives, columns: (n,) by which.
-        b: (m,) minus the residuals.
-        measured: False for a prior.
-    """
-
-    A: np.ndarray
-    b: np.ndarray
-    columns: np.ndarray
-    measured: bool
-
-    def of_stop(self, stop: int, place: np.ndarray | None = None) -> ClusteredRows:
-        """The same as rows of a stop, each of a place (m,); -1 for none, as without it."""
-        at = np.full(len(self.b), stop)
-        place = np.full(len(self.b), -1) if place is None else place
-        return ClusteredRows(A=self.A, b=self.b, columns=self.columns, stop=at, place=place)
 
 
 @dataclass(frozen=True)
@@ -60,9 +39,9 @@ class KeptSums:
     columns: np.ndarray
 
     @classmethod
-    def of(cls, rows: OwnRows) -> KeptSums:
-        """Of rows, however many."""
-        return cls(square(np.column_stack([rows.A, rows.b])), rows.columns)
+    def of(cls, A: np.ndarray, b: np.ndarray, columns: np.ndarray) -> KeptSums:
+        """Of rows (m, n), however many, with a right side (m,)."""
+        return cls(square(np.column_stack([A, b])), columns)
 
 
 @dataclass(frozen=True)
@@ -96,12 +75,12 @@ class Assembly:
 
     Args:
         layout: which column is what.
-        own: stop -> rows about its own unknowns.
+        own: rows about stops' own unknowns.
         raw: whether the Gram matrix before eliminations is wanted.
     """
 
-    def __init__(self, layout: Layout, own: Mapping[int, Sequence[OwnRows]], raw: bool) -> None:
-        self.layout, self.waiting = layout, dict(own)
+    def __init__(self, layout: Layout, own: Sequence[OwnRows], raw: bool) -> None:
+        self.layout, self.rows, self.waiting = layout, own, _waiting(layout, own)
         self.raw = np.zeros((len(layout.kept), len(layout.kept))) if raw else None
         self.cells = np.concatenate([layout.finest, layout.cells])
         self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
@@ -109,10 +88,12 @@ class Assembly:
         self.half = np.zeros((len(self.columns), len(self.columns)))
         # What goes with stops' own unknowns, apart where it is asked what there was before.
         self.taken = np.zeros_like(self.half) if raw else self.half
-        self.chi2 = sum(float(rows.b @ rows.b) for each in own.values() for rows in each)
+        self.chi2 = sum(float(rows.b @ rows.b) for rows in own)
         self.touched = np.zeros(layout.size, bool)
-        for rows in (r for each in own.values() for r in each if r.measured):
-            self.touched[rows.columns] |= layout.moves(rows.A, rows.columns)
+        for rows in (rows for rows in own if rows.measured):
+            shared = rows.shared.reshape(len(rows.b), -1)
+            self.touched[rows.shared_columns] |= layout.moves(shared, rows.shared_columns)
+            self.touched[rows.own_columns[layout.moves(rows.own, rows.own_columns)]] = True
         self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.scans: dict[int, OwnSums] = {}
@@ -322,9 +303,8 @@ class Assembly:
         """Columns (m,) that a stop's own rows touch, its own first and the right side last, and
         where among them each of all stands."""
         size, own = self.layout.size, self._own(stop)
-        rows = (each.columns for each in self.waiting.get(stop, ()))
-        touched = np.unique(np.concatenate([*rows, [size]]).astype(int))
-        mine = np.concatenate([own, np.setdiff1d(touched, own)])
+        shared = (self.rows[each.of].shared_columns for each in self.waiting.get(stop, ()))
+        mine = np.concatenate([own, np.unique(np.concatenate([*shared, [size]])).astype(int)])
         return mine, positions(size + 1, mine)
 
     def _own(self, stop: int) -> np.ndarray:
@@ -333,29 +313,51 @@ class Assembly:
     def _alike(self, stops: Sequence[int]) -> list[list[int]]:
         """Stops whose rows touch the same unknowns, but for their own, in the same order."""
         found: dict[object, list[int]] = {}
-        place = np.full(self.layout.size, -1)
         for stop in stops:
-            own = self._own(stop)
-            place[own] = -2 - np.arange(len(own))
-            like: list[object] = [len(own)]
-            for rows in self.waiting.get(stop, ()):
-                at = place[rows.columns]
-                like += [len(rows.b), np.where(at < -1, at, rows.columns).tobytes()]
-            place[own] = -1
-            found.setdefault(tuple(like), []).append(stop)
+            some = self.waiting.get(stop, ())
+            like = len(self._own(stop)), tuple((each.of, each.order) for each in some)
+            found.setdefault(like, []).append(stop)
         return list(found.values())
 
     def _stacked(self, stops: Sequence[int], at: np.ndarray, width: int) -> np.ndarray:
         """Own rows (K, m, width) of stops that are alike, in units of sigmas; `at` says where the
         columns of the first of them stand."""
         each = list(zip(*(self.waiting.get(stop, ()) for stop in stops), strict=True))
-        out, first = np.zeros((len(stops), sum(len(rows[0].b) for rows in each), width)), 0
-        for rows in each:
-            here = slice(first, first := first + len(rows[0].b))
-            sigma = self.layout.sigma[np.stack([r.columns for r in rows])]
-            out[:, here, at[rows[0].columns]] = np.stack([r.A for r in rows]) * sigma[:, None]
-            out[:, here, -1] = np.stack([r.b for r in rows])
+        parts = [(self.rows[some[0].of], np.array([one.at for one in some])) for some in each]
+        out = np.zeros((len(stops), sum(rows.of_each for rows, _ in parts), width))
+        first, sigma = 0, self.layout.sigma
+        for rows, k in parts:
+            here = out[:, first : first + rows.of_each]
+            first += rows.of_each
+            shared, own = rows.shared_columns, rows.own_columns[k]
+            here[:, :, at[shared]] = rows.shared[k] * sigma[shared]
+            here[:, :, at[own[0]]] = rows.own[k] * sigma[own][:, None]
+            here[:, :, -1] = rows.b.reshape(-1, rows.of_each)[k]
         return out
+
+
+class _Waiting(NamedTuple):
+    """Rows of a stop: of which set, which there, and in which order its own unknowns stand in
+    them; a number for each order that there is in the set."""
+
+    of: int
+    at: int
+    order: int
+
+
+def _waiting(layout: Layout, own: Sequence[OwnRows]) -> dict[int, list[_Waiting]]:
+    """Stop -> its rows, of all that have unknowns of their own."""
+    found: dict[int, list[_Waiting]] = {stop: [] for stop in layout.own}
+    rank = np.zeros(layout.size, int)
+    for columns in layout.own.values():
+        rank[columns] = np.arange(len(columns))
+    for of, rows in enumerate(own):
+        order = np.zeros(len(rows.stops), int)
+        for number, some in enumerate(alike(rank[rows.own_columns])):
+            order[some] = number
+        for at, (stop, like) in enumerate(zip(rows.stops.tolist(), order.tolist(), strict=True)):
+            found[stop].append(_Waiting(of, at, like))
+    return found
 
 
 def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> None:

@@ -81,6 +81,37 @@ class ClusteredRows(NamedTuple):
     stop: np.ndarray
     place: np.ndarray
 
+    def with_residuals(self, b: np.ndarray) -> ClusteredRows:
+        """The same with others (m,) on the right side."""
+        return self._replace(b=b)
+
+    def along(self, directions: np.ndarray) -> ClusteredRows:
+        """The rows over q directions (U, q) in all unknowns."""
+        every = np.arange(directions.shape[1])
+        return self._replace(A=self.A @ directions[self.columns], columns=every)
+
+    def entries(self) -> Entries:
+        """All rows, as what in them is not zero."""
+        return Entries.of(self.A, self.columns)
+
+    def gradients(self) -> tuple[Entries, np.ndarray, np.ndarray]:
+        """``J^T W b`` of each cluster; and the stop and place (C,) of each. Each row of a sparse
+        derivative is a cluster of its own."""
+        if issparse(self.A):
+            found, clusters = self.A.multiply(self.b[:, None]), (self.stop, self.place)
+        elif np.ptp(self.stop) == 0 == np.ptp(self.place):
+            found, clusters = (self.b @ self.A)[None], (self.stop[:1], self.place[:1])
+        else:
+            pairs, cell = np.unique([self.stop, self.place], axis=1, return_inverse=True)
+            shape = len(self.b), pairs.shape[1]
+            pick = csr_array((self.b, cell, np.arange(len(self.b) + 1)), shape=shape)
+            found, clusters = pick.T @ self.A, tuple(pairs)
+        return Entries.of(found, self.columns), *clusters
+
+    def add_gradient(self, b: np.ndarray, out: np.ndarray) -> None:
+        """Add ``J^T b`` of a right side (m,) to (U,)."""
+        out[self.columns] += self.A.T @ b
+
 
 class CellSums(NamedTuple):
     """Sums of a stop's whitened rows along P directions, by what they look at.
@@ -129,21 +160,12 @@ class Gradients:
         place: np.ndarray,
     ) -> None:
         """Add clusters (C, n) over some columns (n,), of stops and places (C,), -1 for none."""
-        self._entries.append(Entries.of(gradient, columns))
-        self._clusters.append(np.stack([stop, place]))
+        self.add_entries(Entries.of(gradient, columns), stop, place)
 
-    def add_rows(self, rows: ClusteredRows) -> None:
-        """Add whitened rows; each of a sparse derivative is a cluster of its own."""
-        if issparse(rows.A):
-            self.add(rows.A.multiply(rows.b[:, None]), rows.columns, rows.stop, rows.place)
-            return
-        if np.ptp(rows.stop) == 0 == np.ptp(rows.place):
-            self.add((rows.b @ rows.A)[None], rows.columns, rows.stop[:1], rows.place[:1])
-            return
-        pairs, cell = np.unique([rows.stop, rows.place], axis=1, return_inverse=True)
-        count = len(rows.b)
-        pick = csr_array((rows.b, cell, np.arange(count + 1)), shape=(count, pairs.shape[1]))
-        self.add(pick.T @ rows.A, rows.columns, *pairs)
+    def add_entries(self, entries: Entries, stop: np.ndarray, place: np.ndarray) -> None:
+        """Add clusters as rows give them, see `ClusteredRows.gradients`."""
+        self._entries.append(entries)
+        self._clusters.append(np.stack([stop, place]))
 
     def table(self) -> tuple[csr_array, np.ndarray, np.ndarray]:
         """All clusters (C, U), sparse; the stop and the place (C,) of each."""

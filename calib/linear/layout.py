@@ -34,6 +34,7 @@ class Layout:
         sigma: (U,) how well each was known before, which is its unit; 1 where there is no prior.
         stops: recording's folder and number of a stop -> its number here.
         own: stop -> columns of its own unknowns.
+        owner: (U,) the stop whose own unknown stands in a column, -1 for those of no stop.
         finest: (C,) columns of the finest cells of each mesh; cells: (D,) of all others.
         kept: (S,) columns that are not eliminated, ascending.
         bodies: the problem's blocks of seen bodies that depend on stops' own unknowns.
@@ -50,6 +51,7 @@ class Layout:
     sigma: np.ndarray
     stops: Mapping[StopKey, int]
     own: Mapping[int, np.ndarray]
+    owner: np.ndarray
     finest: np.ndarray
     cells: np.ndarray
     kept: np.ndarray
@@ -97,6 +99,9 @@ class Layout:
             own.setdefault(owner[name], []).append(np.r_[at[name]])
         finest, cells = (_join(at, names) for names in _cells(unknowns))
         inner = [*own.values(), [finest], [cells]]
+        whose = np.full(ends[-1], -1)
+        for stop, columns in own.items():
+            whose[np.concatenate(columns)] = stop
         eliminated = np.concatenate([c for part in inner for c in part]).astype(int)
         about_own = [any(n in owner for n in block.variables) for block in problem.blocks]
         bodies = [b for b, its in zip(problem.blocks, about_own, strict=True) if its]
@@ -107,6 +112,7 @@ class Layout:
             sigma=np.concatenate(sigma),
             stops=stops,
             own={stop: np.concatenate(columns) for stop, columns in own.items()},
+            owner=whose,
             finest=finest,
             cells=cells,
             kept=np.setdiff1d(np.arange(ends[-1]), eliminated),
@@ -130,6 +136,11 @@ class Layout:
             self.asked[wanted].flags.writeable = False
         return self.asked[wanted]
 
+    def columns_of_each(self, names: Sequence[str]) -> np.ndarray:
+        """Columns (K, n) of K unknowns that have as many components each."""
+        first = np.array([self.at[name].start for name in names])
+        return first[:, None] + np.arange(self.unknowns[names[0]].dim)
+
     def inner(self) -> Iterator[str]:
         """Unknowns that are eliminated before the graph is solved."""
         gone = np.ones(self.size, bool)
@@ -137,9 +148,10 @@ class Layout:
         return (name for name, at in self.at.items() if gone[at].any())
 
     def moves(self, A: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Whether rows (m, n) of measurements depend on unknowns that stand in columns (n,) at all:
-        by more than rounding makes of it."""
-        return (np.abs(A) * self.sigma[columns]).max(axis=0, initial=0.0) > ROUNDED_ROW
+        """Whether rows (..., m, n) of measurements depend on unknowns that stand in columns
+        (..., n) at all: by more than rounding makes of it."""
+        largest = np.maximum(A.max(axis=-2, initial=0.0), -A.min(axis=-2, initial=0.0))
+        return largest * self.sigma[columns] > ROUNDED_ROW
 
     def outer(self) -> dict[str, Unknown]:
         """Unknowns that the graph solves for."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import Assembly, KeptSums, OwnRows
+from calib.linear.assembly import Assembly, KeptSums
 from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
+from calib.linear.own import OwnRows, own_rows
 from calib.linear.parallel import over_stops
 from calib.linear.rows import State, StopRows, StopSums, Weighing
 from calib.linear.system import Linearisation, Values
@@ -19,7 +21,6 @@ from calib.problem import Problem
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.spread import SpreadRows
-from chains import se3
 
 Progress = Callable[[int, int], None]
 
@@ -35,7 +36,7 @@ def linearise(
     progress: Progress = lambda done, total: None,
     weighed: Sequence[Weighing] = (),
     slowed: Sequence[Weighing] = (),
-    own: Mapping[int, Sequence[OwnRows]] | None = None,
+    own: Sequence[OwnRows] | None = None,
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
 
@@ -81,6 +82,21 @@ def linearise(
     )
 
 
+class ScatterRows(NamedTuple):
+    """Whitened rows of the scatter within a hold: derivatives (m, n) by kept unknowns, minus the
+    residuals (m,), and by which columns (n,)."""
+
+    A: np.ndarray
+    b: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, spread: SpreadRows, layout: Layout) -> ScatterRows:
+        """Over the columns of a layout."""
+        columns = layout.columns(list(spread.columns))
+        return cls(np.hstack(list(spread.columns.values())), -spread.residual, columns)
+
+
 @dataclass(frozen=True)
 class _OfStop:
     """What a stop adds.
@@ -122,17 +138,16 @@ def _of_stop(
     here, scatter = Weighing.of(rows.rows, state, placed.T[0]), None
     at = partial(_rows_at, scan, association)
     if rows.rows.spread is not None:
-        scatter = spread_rows(rows.rows.spread, layout)
+        scatter = ScatterRows.of(rows.rows.spread, layout)
     met, gradients = None, []
     if clustered:
         met, cluster = rows.places()
         gradients.append(rows.gradient(cluster, len(met)))
         if scatter is not None:
-            by_row = scatter.b[:, None] * scatter.A
-            gradients.append((summed(by_row, cluster), scatter.columns))
+            gradients.append((summed(scatter.b[:, None] * scatter.A, cluster), scatter.columns))
     return _OfStop(
         sums=rows.sums(),
-        scatter=None if scatter is None else KeptSums.of(scatter),
+        scatter=None if scatter is None else KeptSums.of(*scatter),
         met=met,
         gradients=gradients,
         weighed=here,
@@ -185,45 +200,4 @@ def lidars(scans: Sequence[ScanStop], values: Values) -> list[Placed]:
         each = place_each([scans[i].stops for i in some], frame, values)
         for i, placed in zip(some, each, strict=True):
             found[i] = placed
-    return found
-
-
-def spread_rows(spread: SpreadRows, layout: Layout) -> OwnRows:
-    """Rows of the scatter within a hold, over kept unknowns."""
-    columns = layout.columns(list(spread.columns))
-    return OwnRows(np.hstack(list(spread.columns.values())), -spread.residual, columns, True)
-
-
-def own_rows(layout: Layout, values: Values) -> dict[int, list[OwnRows]]:
-    """Stop -> rows of its tracked bodies, and of the priors of its own unknowns."""
-    found: dict[int, list[OwnRows]] = {stop: [] for stop in layout.own}
-    owner = {int(c): stop for stop, columns in layout.own.items() for c in columns}
-    for together in layout.bodies:
-        for residual, A, names in together.rows(values):
-            stop = next(owner[k] for n in names if (k := layout.at[n].start) in owner)
-            found[stop].append(OwnRows(A, -residual, layout.columns(names), True))
-    mine = [name for name, at in layout.at.items() if at.start in owner]
-    for name, rows in prior_rows(layout, mine, values).items():
-        found[owner[layout.at[name].start]].append(rows)
-    return found
-
-
-def prior_rows(layout: Layout, names: Sequence[str], values: Values) -> dict[str, OwnRows]:
-    """Rows of the own priors of vectors and poses, by unknown."""
-    found = {}
-    poses = [name for name in names if layout.unknowns[name].kind == "pose"]
-    place = {name: k for k, name in enumerate(poses)}
-    if poses:
-        means = np.stack([layout.unknowns[name].mean for name in poses])
-        away = se3.log(se3.inverse(means) @ np.stack([values[name] for name in poses]))
-        turns = se3.right_jacobian_inverse(away)
-    for name in names:
-        unknown, columns = layout.unknowns[name], layout.columns([name])
-        if unknown.kind == "pose":
-            k = place[name]
-            A, b = turns[k] / unknown.prior_sigma[:, None], -away[k] / unknown.prior_sigma
-        else:
-            sigma = unknown.prior_sigma
-            A, b = np.diag(1.0 / sigma), (unknown.mean - values[name]) / sigma
-        found[name] = OwnRows(A, b, columns, measured=False)
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
@@ -223,22 +224,19 @@ class BodiesTogether:
         residual, _ = self.whole.evaluate({**values, **self._at(values)}, False)
         return iter(residual.reshape(len(self.blocks), -1))
 
-    def rows(self, values: Values) -> Iterator[tuple[np.ndarray, np.ndarray, list[str]]]:
-        """Whitened rows (m,) of each block, their derivatives (m, n), and by which unknowns."""
+    def evaluate_all(self, values: Values) -> tuple[np.ndarray, Derivatives]:
+        """Whitened rows (K, m) of the K blocks, and their derivatives (K, m, n); see `named`."""
         residual, d = self.whole.evaluate({**values, **self._at(values)}, True)
-        count = len(self.blocks)
-        A = np.hstack(list(d.values())).reshape(count, -1, sum(x.shape[1] for x in d.values()))
-        each = zip(residual.reshape(count, -1), A, self.blocks, strict=True)
-        for rows, by, block in each:
-            named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
-            yield rows, by, [named.get(name, name) for name in d]
+        rows = residual.reshape(len(self.blocks), -1)
+        return rows, {name: x.reshape(*rows.shape, -1) for name, x in d.items()}
+
+    def named(self, name: str) -> Sequence[str]:
+        """What the unknown of the whole is called in each of the blocks; once, if all share it."""
+        return self._own.get(name, (name,))
 
     def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
         """Rows and derivatives of each block, as `SeenBody.evaluate` gives them."""
-        residual, d = self.whole.evaluate({**values, **self._at(values)}, True)
-        count = len(self.blocks)
-        rows = residual.reshape(count, -1)
-        by = {name: x.reshape(count, rows.shape[1], -1) for name, x in d.items()}
+        rows, by = self.evaluate_all(values)
         for k, block in enumerate(self.blocks):
             named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
             yield rows[k], {named.get(name, name): x[k] for name, x in by.items()}
@@ -250,14 +248,17 @@ class BodiesTogether:
 
     def _at(self, values: Values) -> dict[str, np.ndarray]:
         """Values of the blocks' own unknowns, as those of the whole."""
+        counts = [len(block.measured) for block in self.blocks]
         return {
-            name: np.concatenate([np.repeat(values[v][None], len(b.measured), 0) for v, b in pairs])
-            for name, pairs in self._own().items()
+            name: np.repeat(np.stack([values[v] for v in names]), counts, axis=0)
+            for name, names in self._own.items()
         }
 
-    def _own(self) -> dict[str, list[tuple[str, SeenBody]]]:
-        names = self.whole.stops.own
-        return {n: [(b.stops.own[i], b) for b in self.blocks] for i, n in enumerate(names)}
+    @cached_property
+    def _own(self) -> dict[str, tuple[str, ...]]:
+        """What each unknown of the whole that blocks have for themselves is called in them."""
+        names = zip(*(block.stops.own for block in self.blocks), strict=True)
+        return dict(zip(self.whole.stops.own, names, strict=True))
 
 
 def evaluated(blocks: Sequence[SeenBody], values: Values) -> list[tuple[np.ndarray, Derivatives]]:

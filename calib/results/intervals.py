@@ -35,12 +35,12 @@ import numpy as np
 from calib.effects import FrameOffset
 from calib.linear.cluster_sums import ROUNDED_SHARE, ClusterSums
 from calib.linear.clusters import ClusteredRows, Gradients
-from calib.linear.linearise import own_rows
+from calib.linear.own import own_rows
 from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Role
-from calib.solve.clustered import BeamsAlong, of_cells, of_graph, of_stops
+from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.graph import KeptRows
@@ -203,7 +203,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     )
     for cells, scatter in beams.cells():
         sums.add_stop(cells, scatter)
-    others = [*of_stops(own_rows(layout, values)), *_of_cells(estimate, places)]
+    others = [*own_rows(layout, values), *_of_cells(estimate, places)]
     frames, paper, given = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
     for block, name, rows in of_graph(estimate.graph, layout, values):
         stated = block is None and problem.variables[name].role is Role.CALIBRATION
@@ -215,7 +215,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
             rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
         if not isinstance(block, KeptRows):
             others.append(rows)
-    A = np.vstack([rows.A @ directions[rows.columns] for rows in others])
+    A = np.vstack([rows.along(directions).A for rows in others])
     b, stop, place = (
         np.concatenate([getattr(r, k) for r in others]) for k in ("b", "stop", "place")
     )

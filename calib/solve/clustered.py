@@ -16,10 +16,9 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from calib.forward import Placed
-from calib.linear.assembly import OwnRows
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.linear.layout import Layout, keys_of
-from calib.linear.linearise import lidars, spread_rows
+from calib.linear.linearise import ScatterRows, lidars
 from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES, StopRows
 from calib.problem.problem import Block, Problem, SurfaceCells
@@ -118,7 +117,7 @@ def _scatter(
     """Derivatives and right side of the rows of scatter within holds."""
     if rows.rows.spread is None:
         return None
-    more = spread_rows(rows.rows.spread, layout)
+    more = ScatterRows.of(rows.rows.spread, layout)
     return more.A @ directions[more.columns], more.b
 
 
@@ -165,12 +164,6 @@ def _of_rows(
     rows = StopRows.of(scan, layout, values, placed, association, times=times)
     parts, cluster = rows.places(kinds)
     return parts, found(rows, cluster, len(parts))
-
-
-def of_stops(own: Mapping[int, Sequence[OwnRows]]) -> Iterator[ClusteredRows]:
-    """Rows about what stops alone have, as `own_rows` gives them: bodies that are seen there, and
-    priors."""
-    return (rows.of_stop(stop) for stop, some in own.items() for rows in some)
 
 
 def of_cells(

@@ -8,9 +8,9 @@ from calib.diagnosis.linear import WIDENED, other_rows
 from calib.diagnosis.score import project, score_test
 from calib.diagnosis.stand import Stand
 from calib.effects import GEOMETRY, find
-from calib.linear.clusters import Gradients
+from calib.linear.clusters import Gradients, over_all
 from calib.linear.layout import Layout
-from calib.linear.linearise import own_rows
+from calib.linear.own import own_rows
 from calib.problem.model import Model, Source
 from calib.solve.fit import solve
 
@@ -52,7 +52,7 @@ def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
     layout, values = Layout.of(stand.problem), stand.estimate.values
     own = own_rows(layout, values)
     rows = list(other_rows(stand.problem, layout, values, Gradients(layout.size), own))
-    A = np.concatenate([_dense(r, layout.size) for r in rows])
+    A = over_all([r.entries() for r in rows], layout.size).toarray()
     e, stop = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop"))
     # Priors of the hardware are wider among these rows than they are in the fit.
     wide = np.where(stop < 0, WIDENED, 1.0)
@@ -67,12 +67,6 @@ def test_a_stop_grows_by_its_part_of_the_hat_matrix(tmp_path, make):
         expected = axes @ (root * (axes.T @ e[mine]))
         np.testing.assert_allclose(grown[mine], expected, atol=2e-3)
     assert np.array_equal(grown[stop < 0], e[stop < 0])
-
-
-def _dense(rows, size):
-    out = np.zeros((len(rows.b), size))
-    out[:, rows.columns] = rows.A
-    return out
 
 
 def test_scores_scatter_as_far_as_clusters_say(tmp_path):

@@ -20,9 +20,9 @@ from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import beside, other_rows
 from calib.diagnosis.score import GAUGE, Scores, ScoreTest, score_test
 from calib.linear.arrow import Arrow, apart, cheapest
-from calib.linear.clusters import Entries, Gradients, over_all, summed
+from calib.linear.clusters import Gradients, over_all, summed
 from calib.linear.layout import Layout
-from calib.linear.linearise import own_rows
+from calib.linear.own import own_rows
 from calib.linear.rows import TWIST
 from calib.problem import Problem
 from calib.residuals.robust import MAD
@@ -359,6 +359,6 @@ def rows_of_others(
     """Rows of trackers, targets and priors: (R, U) whitened, (R,) their right side, and the stop
     and place (R,) of each."""
     rows = list(other_rows(problem, layout, values, places, own_rows(layout, values)))
-    A = over_all([Entries.of(r.A, r.columns) for r in rows], layout.size)
+    A = over_all([r.entries() for r in rows], layout.size)
     b, stop, place = (np.concatenate([getattr(r, k) for r in rows]) for k in ("b", "stop", "place"))
     return A, b, stop, place
