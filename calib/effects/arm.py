@@ -31,8 +31,9 @@ class ArmLinkLength(Effect):
     source = "circle-point analysis: Mooring, Roth, Driels 1991, Manipulator Calibration"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        told = _own(rig).lengths
-        return tuple(Param(n, "m", 0.005 if n in told else 0.0) for n in rig.arm_edges)
+        told, moving = _own(rig).lengths, rig.joint_names
+        sigma = {name: 0.005 if name in told else 0.0 for name in rig.arm_edges}
+        return tuple(Param(n, "m", s, joint=n if n in moving else "") for n, s in sigma.items())
 
     def basis(self, view: View) -> np.ndarray:
         tree, lengths = view.rig.tree, _own(view.rig).lengths
@@ -57,7 +58,7 @@ class ArmJointOffset(Effect):
     sigma = 0.005
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, unit, self.sigma) for joint, unit in _units(rig).items())
+        return tuple(Param.of_joint(j, unit, self.sigma) for j, unit in _units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
@@ -114,7 +115,8 @@ class ArmAxisTilt(Effect):
     source = "Hayati and Mirmirani 1985, J. Robotic Systems 2(4): parallel axes need a tilt"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(f"{j}.{side}", "rad", 0.003) for j in rig.joint_names for side in "ab")
+        sides = [(joint, side) for joint in rig.joint_names for side in "ab"]
+        return tuple(Param.of_joint(joint, "rad", 0.003, side) for joint, side in sides)
 
     def basis(self, view: View) -> np.ndarray:
         tree = view.rig.tree
@@ -146,7 +148,11 @@ class ArmGeometry(Effect):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         sigma = {"rad": 0.003, "m": 0.005}  # of arm_axis_tilt and arm_link_length
-        return tuple(Param(f"{s.edge}.{s.name}", s.unit, sigma[s.unit]) for s in _own(rig).slips)
+        moving = {name: name for name in rig.joint_names}
+        return tuple(
+            Param(f"{s.edge}.{s.name}", s.unit, sigma[s.unit], joint=moving.get(s.edge, ""))
+            for s in _own(rig).slips
+        )
 
     def basis(self, view: View) -> np.ndarray:
         slips, names = _own(view.rig).slips, view.rig.tree.edge_names
@@ -190,7 +196,7 @@ class ArmRailBending(Effect):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(
-            Param(f"{edge.joint.name}.{way}", self.unit, self.sigma)
+            Param.of_joint(edge.joint.name, self.unit, self.sigma, way)
             for edge in _rails(rig)
             for way in ("bend_a", "bend_b", "twist")
         )
@@ -228,7 +234,7 @@ class ArmJointScale(Effect):
     source = "size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, "1", 0.001) for joint in rig.joint_names)
+        return tuple(Param.of_joint(joint, "1", 0.001) for joint in rig.joint_names)
 
     def basis(self, view: View) -> np.ndarray:
         return view.joints[:, :, None] * np.eye(view.joints.shape[1])
@@ -250,8 +256,9 @@ class ArmJointEccentricity(Effect):
     shape = 1.0
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        turning = (joint for joint, unit in _units(rig).items() if unit == "rad")
-        return tuple(Param(f"{j}.{f}", "rad", self.sigma) for j in turning for f in ("sin", "cos"))
+        turning = [joint for joint, unit in _units(rig).items() if unit == "rad"]
+        each = [(joint, wave) for joint in turning for wave in ("sin", "cos")]
+        return tuple(Param.of_joint(joint, "rad", self.sigma, wave) for joint, wave in each)
 
     def basis(self, view: View) -> np.ndarray:
         turning = [j for j, unit in enumerate(_units(view.rig).values()) if unit == "rad"]
@@ -293,7 +300,7 @@ class ArmBacklash(Effect):
     column = "moved"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, unit, 0.0005) for joint, unit in _units(rig).items())
+        return tuple(Param.of_joint(joint, unit, 0.0005) for joint, unit in _units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
         way = np.stack([view[f"{self.column}.{joint}"] for joint in view.rig.joint_names], axis=1)
@@ -315,7 +322,7 @@ class ArmJointLag(ArmBacklash):
     column = "travel"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param(joint, "1", 0.0005) for joint in rig.joint_names)
+        return tuple(Param.of_joint(joint, "1", 0.0005) for joint in rig.joint_names)
 
 
 class ArmJointThermal(ArmJointOffset):

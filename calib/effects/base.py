@@ -44,12 +44,19 @@ class Site(Enum):
 @dataclass(frozen=True)
 class Param:
     """One unknown of an effect: name, unit, and how large it may plausibly be; 0 holds it. A fit
-    begins at `start`: where that is far out, beams are judged by it."""
+    begins at `start`: where that is far out, beams are judged by it. One about a `joint` that moves
+    names it."""
 
     name: str
     unit: str
     sigma: float
     start: float = 0.0
+    joint: str = ""
+
+    @classmethod
+    def of_joint(cls, joint: str, unit: str, sigma: float, part: str = "") -> Self:
+        """The unknown of a joint, or that `part` of what it has."""
+        return cls(f"{joint}.{part}" if part else joint, unit, sigma, joint=joint)
 
 
 LazyColumn = np.ndarray | Callable[[], np.ndarray]

@@ -150,7 +150,7 @@ class ArmLinkBending(Effect):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         joints = rig.joint_names if rig.masses else ()
-        return tuple(Param(joint, self.unit, SOFT / 5) for joint in joints)
+        return tuple(Param.of_joint(joint, self.unit, SOFT / 5) for joint in joints)
 
     def basis(self, view: View) -> np.ndarray:
         tree, joints = view.rig.tree, view.rig.joint_names
@@ -250,4 +250,4 @@ def _payloads(view: View) -> list[Mass]:
 def _per_joint(rig: Rig) -> tuple[Param, ...]:
     """How much each joint gives way."""
     each = zip(rig.joint_names, rig.joint_kinds, strict=True)
-    return tuple(Param(joint, PER_TORQUE[kind], SOFT) for joint, kind in each)
+    return tuple(Param.of_joint(joint, PER_TORQUE[kind], SOFT) for joint, kind in each)

@@ -188,9 +188,7 @@ class Model:
         free = [
             i
             for i, p in enumerate(effect.params(rig))
-            if p.sigma
-            and f"{effect.name}.{p.name}" not in self.fixed
-            and rig.joint_of(p.name) not in passive
+            if p.sigma and f"{effect.name}.{p.name}" not in self.fixed and p.joint not in passive
         ]
         return np.array(free, int)
 

@@ -156,11 +156,6 @@ class Rig:
         """ "revolute" or "prismatic", by joint."""
         return tuple(joint.kind for joint in self.joints)
 
-    def joint_of(self, parameter: str) -> str:
-        """The moving joint that a parameter is named after, alone or before a point; else empty."""
-        mine = (j for j in self.joint_names if parameter == j or parameter.startswith(f"{j}."))
-        return max(mine, key=len, default="")  # a joint's name may have a point in it, too
-
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))

@@ -81,6 +81,21 @@ def test_a_basis_has_the_shape_of_its_site(effect, views):
 
 
 @pytest.mark.parametrize("effect", SHAPED, ids=lambda e: e.name)
+def test_a_parameter_of_a_joint_moves_that_joint_alone(effect, views):
+    """And none is of a joint because of its name: a gantry's may be called x and y, as are the two
+    ways in which a foot tilts."""
+    view = views[effect.site]
+    about = np.array([p.joint for p in effect.params(view.rig)])
+    assert set(about) <= {"", *view.rig.joint_names}
+    if effect.site is Site.JOINTS:
+        moved = np.abs(effect.basis(view)).max(axis=0) > 0
+        other = about != np.array(view.rig.joint_names)[:, None]
+        assert not (moved & other & (about != "")).any()
+    assert effect.site in (Site.JOINTS, Site.EDGE) or not any(about)
+    assert effect.family not in ("base_flex", "arm_payload_offset") or not any(about)
+
+
+@pytest.mark.parametrize("effect", SHAPED, ids=lambda e: e.name)
 def test_the_catalogue_says_what_an_effect_is(effect, views):
     assert effects.find(effect.name) is effect and effects.read(effect.document()) is effect
     assert effect.formula and effect.typical and effect.source

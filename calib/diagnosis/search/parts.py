@@ -54,7 +54,7 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
     test = candidate.test
     whole = Explained(test.statistic, test.dof)
     rig = look.stand.sources[0].rig
-    of = np.array([rig.joint_of(param.name) for param in candidate.effect.params(rig)])
+    of = np.array([param.joint for param in candidate.effect.params(rig)])
     joints = np.unique(of[of != ""]).tolist()
     if len(of) != len(test.columns) or len(joints) < 2:
         return whole
