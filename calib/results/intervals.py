@@ -48,6 +48,7 @@ from calib.solve.graph import KeptRows
 REGION = "region"
 # Parts of the room, whose beams share the error of the mesh or plane there.
 ROOM_PARTS = (REGION, *PLACES)
+KNOWN_BEFORE = (Role.CALIBRATION, Role.GRAVITY, Role.ZERO)  # whose own priors are no measurements
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,8 @@ class Intervals:
         data: (Q, Q) the part of that which is due to errors of rows; the rest is due to priors.
         paper: (Q, Q) the part of it that is due to errors of CAD.
         given: (Q, Q) the part that is due to errors of what was known before any row: of CAD, of
-            data sheets, and of an earlier run. How far residuals exceed their sigmas says nothing
-            of these.
+            data sheets, of levels' zeros, and of an earlier run. How far residuals exceed their
+            sigmas says nothing of these.
         wider: (Q,) how many times wider than the graph has it each interval is, at least 1.
         least: how many times larger than their sigmas the errors of rows are, at least 1: all but
             what is due to `given` is so much wider.
@@ -206,9 +207,9 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     others = [*own_rows(layout, values), *_of_cells(estimate, places)]
     frames, paper, given = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
     for block, name, rows in of_graph(estimate.graph, layout, values):
-        stated = block is None and problem.variables[name].role is Role.CALIBRATION
+        stated = block is None and problem.variables[name].role in KNOWN_BEFORE
         if stated or isinstance(block, JointPrior):
-            A = rows.A @ directions[rows.columns]
+            A = rows.along(directions).A
             given += A.T @ A
             paper += A.T @ A if stated and name in frames else 0.0
         if block is not None and block.kind == "target":

@@ -171,36 +171,36 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
     )
 
 
-def up_of(estimate: Estimate, widened: float) -> dict[str, Any] | None:
+def up_of(estimate: Estimate, known: Intervals) -> dict[str, Any] | None:
     """Which way is up in the world's frame, as levels and rods tell, as summary.json holds it; None
     where no rig has a level.
 
     Args:
         estimate: the solution.
-        widened: by how much its sigmas are too small.
+        known: how well its unknowns are known.
     """
     problem = estimate.problem
     if GRAVITY not in problem.variables or not any(s.rig.levels for s in problem.sources):
         return None
     g, by_gravity = down(estimate.values[GRAVITY])
-    C = by_gravity @ estimate.covariance_of([GRAVITY]) @ by_gravity.T
-    world, sigma_rad = problem.sources[0].rig.world, widened * float(np.sqrt(np.trace(C) / 2))
+    C = by_gravity @ known.over(estimate, [GRAVITY]) @ by_gravity.T
+    world, sigma_rad = problem.sources[0].rig.world, float(np.sqrt(np.trace(C) / 2))
     lean, known = 1e3 * np.arctan2(np.hypot(*g[:2]), -g[2]), 1e3 * sigma_rad
     told = f"up lies {lean:.2f} mrad off z of '{world}', and is known to {known:.2g} mrad"
     return {"frame": world, "xyz": -g, "sigma_rad": sigma_rad, "told": told}
 
 
-def zeros_of(estimate: Estimate, widened: float) -> list[dict[str, Any]]:
+def zeros_of(estimate: Estimate, known: Intervals) -> list[dict[str, Any]]:
     """What the axes of each level read where they feel nothing, over 1 g, as summary.json holds it.
 
     Args:
         estimate: the solution.
-        widened: by how much its sigmas are too small.
+        known: how well its unknowns are known.
     """
     out = []
     for name in (n for n, u in estimate.problem.variables.items() if u.role is Role.ZERO):
         owner, xyz = estimate.problem.variables[name].owner, estimate.values[name]
-        sigma = widened * np.sqrt(np.diag(estimate.covariance_of([name])))
+        sigma = np.sqrt(np.diag(known.over(estimate, [name])))
         axes = zip("xyz", 1e3 * xyz, 1e3 * sigma, strict=True)
         told = ", ".join(f"{axis} {b:+.2f} ± {s:.2g}" for axis, b, s in axes)
         out.append(

@@ -278,8 +278,8 @@ def _fit(
     summary |= {"intervals_wider_by": calibration.document(solution.names)}
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document() if reached else None
-    summary |= {"up": up} if (up := up_of(estimate, known.least)) else {}
-    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, known.least)) else {}
+    summary |= {"up": up} if (up := up_of(estimate, known)) else {}
+    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, known)) else {}
     summary["seconds"] = time.monotonic() - began
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
