@@ -55,7 +55,7 @@ def without_mesh_errors(stand: Stand, effects: Sequence[Effect]) -> Scores:
         # What the mesh's errors took on is in the residual again.
         problem=replace(fit.problem, cells={}, scans=[replace(s, cells={}) for s in fit.scans]),
     )
-    linear, _ = replace(stand, estimate=bare).linearise(effects, silent)
+    linear, _, _ = replace(stand, estimate=bare).linearise(effects, silent)
     none = np.full(1, -1)
     whole = csr_array(linear.gradient.sum(axis=0)[None])
     return project(replace(linear, gradient=whole, stop=none, place=none), linear.candidates)
