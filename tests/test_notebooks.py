@@ -14,7 +14,7 @@ SHOWN = {  # what the outputs of each hold, beside figures
     "what_is_missing": [
         "verdict: an effect is missing",
         "verdict: the model is adequate",
-        "<pre>ring_range_offset differs by",
+        "ring_range_offset differs by",
     ],
     "your_own_effect": ["humid_air is missing", "<td>amount</td>"],
 }

@@ -101,7 +101,7 @@ def own_rows(layout: Layout, values: Values) -> list[OwnRows]:
     found: list[OwnRows] = []
     for together in layout.bodies:
         found += _told_apart(layout, *body_rows(layout, together, values), True)
-    mine = [name for name, at in layout.at.items() if layout.owner[at.start] >= 0]
+    mine = [name for name, at in layout.at.items() if (layout.owner[at] >= 0).any()]
     for names, A, b in priors(layout, mine, values):
         found += _told_apart(layout, A, b, layout.columns_of_each(names), False)
     return found

@@ -46,6 +46,8 @@ def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Prob
             met = (np.unique(problem.scans[i].parts(associations[i], column)) for i in scans)
             parts = np.unique(np.concatenate(list(met)))
             parts = parts[parts >= 0].astype(int)
+            if not len(parts):
+                continue  # no beam meets the room: there is nothing to estimate
             name = kind if on_planes else f"{room}/reference_{column}"
             sigma_m = cell_sigma_m(first, column)
             unknowns.append(_unknown(name, room, column, parts, sigma_m))

@@ -1,4 +1,4 @@
-"""Data that would count twice: in two recordings, or in one and in what is known beforehand."""
+"""Data that would count twice: in one recording or two, or in what is known beforehand too."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.problem.model import Source
+from calib.rig.inventory import copied
 from calib.rig.suspect import listed
 from chains.errors import InputError
 
@@ -36,9 +37,18 @@ def all_once(
         prior: where that run is, if there is one.
 
     Raises:
-        InputError: recordings have measurements in common, or that run knows some of them.
+        InputError: a recording holds a stop twice, recordings have measurements in common, or that
+            run knows some of them.
     """
     found = [_measured(source, each) for source, each in zip(sources, scans, strict=True)]
+    for source, mine in zip(sources, found, strict=True):
+        pairs = copied(source.recording).items()
+        if copies := [stop for stop, of in pairs if stop in mine and mine[stop] == mine.get(of)]:
+            raise InputError(
+                f"{source.recording.folder / 'stops.csv'}: {listed(copies)} repeat other stops "
+                f"({copies[0]} is {dict(pairs)[copies[0]]} again), to every digit of what was "
+                "measured; as data they count once, so remove the rows that are copies"
+            )
     for (one, mine), (other, theirs) in combinations(zip(sources, found, strict=True), 2):
         if same := _among(mine, theirs.values()):
             raise InputError(

@@ -28,7 +28,7 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
-from calib.solve.turned import lidars_turned
+from calib.solve.turned import Axes, axes_of, lidars_turned
 from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
@@ -145,6 +145,7 @@ class _Checker:
             found.contents.extend(inventory.of_stops(rig, recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
             found.odd.extend(inventory.odd_times(recording))
+            found.odd.extend(inventory.odd_copies(recording))
             found.odd.extend(inventory.odd_payloads(rig, recording))
             found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))
@@ -216,6 +217,7 @@ class _Checker:
         if turned := lidars_turned(problem, values):
             values = {**values, **turned}
             self._tell([_turned(problem.scans[0], problem.initial, values)])
+        self._tell(map(_other_axes, axes_of(problem, values)))
         kept, placed = [], []
         for i, scan in enumerate(problem.scans):
             self.progress("placing scans", i, len(problem.scans))
@@ -253,6 +255,21 @@ def _turned(scan: ScanStop, before: Values, after: Values) -> Suspect:
         sentence=f"the scans fit the mesh with {edge.child} turned by {np.degrees(angle):.0f} deg "
         f"from CAD; check its rpy_rad in rig.yaml, which would be about {rpy_rad.tolist()}",
     )
+
+
+def _other_axes(found: Axes) -> str:
+    """That coordinates want to be read with other axes."""
+    if found.read is None:
+        return (
+            f"the scans of '{found.frame}' fit the mesh as a mirror would show them: are x and y "
+            "exchanged, or does the azimuth count the other way round?"
+        )
+    signs, at = found.read.sum(axis=1), np.abs(found.read).argmax(axis=1)
+    read = ", ".join(f"{'-' if s < 0 else ''}{'xyz'[i]}" for s, i in zip(signs, at, strict=True))
+    of = {"mesh": "the mesh's vertices", "tracker": "the bodies' poses"}[found.whose]
+    mirrored = np.linalg.det(found.read) < 0
+    asked = "are they mirrored?" if mirrored else "is another axis up there than elsewhere?"
+    return f"the scans would fit the mesh with {read} of {of} in place of x, y, z: {asked}"
 
 
 def _token(

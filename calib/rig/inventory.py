@@ -183,6 +183,28 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
         )
 
 
+def copied(recording: RecordedStops) -> dict[str, str]:
+    """Stop -> an earlier one with the same joints and the same poses, to every digit."""
+    poses = np.hstack(list(recording.bodies.values()) or [np.zeros((len(recording.stops), 0))])
+    first: dict[bytes, str] = {}
+    found = {}
+    for stop, joints, pose in zip(recording.stops, recording.joints, poses, strict=True):
+        if np.isfinite(pose).any():
+            of = first.setdefault(joints.tobytes() + pose.tobytes(), stop)
+            found |= {stop: of} if of != stop else {}
+    return found
+
+
+def odd_copies(recording: RecordedStops) -> Iterator[str]:
+    """Stops of which others are copies."""
+    if copies := copied(recording):
+        pairs = [f"{stop} of {of}" for stop, of in copies.items()]
+        yield (
+            f"stops.csv holds joints and poses of one stop again at another, to every digit "
+            f"({listed(pairs)}): a copy counts as a second measurement; if it is none, leave it out"
+        )
+
+
 def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Payloads that no arm carries."""
     for name in (PAYLOAD, *(f"{tip}.{PAYLOAD}" for tip in rig.tips)):

@@ -1,9 +1,10 @@
-"""Other starts: a joint's zero, a frame, or the LiDAR in its frame, turned."""
+"""Other starts: a joint's zero, a frame, or the LiDAR in its frame, turned; or scans mirrored."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,6 +35,7 @@ NEAR_M = 0.1  # mean error of these beams that asks for no other orientation: go
 # Of the mean error, what another orientation may have at most: a choice, between good ones' 0.02 m
 # and the 0.1 m from which one is asked for.
 NEARER = 0.5
+MIRROR = np.diag([1.0, -1.0, 1.0])  # any other follows by turns
 
 Values = dict[str, np.ndarray]
 
@@ -92,16 +94,49 @@ def lidars_turned(problem: Problem, values: Mapping[str, np.ndarray]) -> Values:
         The unknowns of the frames to turn, by name: of those LiDARs whose beams are then less than
         half as far off.
     """
-    seen: dict[tuple[str, int], list[_Sampled]] = {}
-    for scan in problem.scans:
-        edge = _free_edge(problem, scan)
-        if edge and isinstance(scan.meeting, MeshSurface):
-            seen.setdefault(edge, []).append(_Sampled(scan, scan.pose(values)))
     return {
         name: _with_turn(values[name], start, turn)
-        for (name, start), scans in seen.items()
+        for (name, start), scans in _sampled(problem, values).items()
         if (turn := _best_turn(scans)) is not None
     }
+
+
+class Axes(NamedTuple):
+    """Coordinates that fit when they are read with other axes.
+
+    Args:
+        whose: "scans", "mesh" or "tracker".
+        frame: of the LiDAR whose scans say so.
+        read: (3, 3) what takes the coordinates that are there to those that fit; None for scans, of
+            which it is only known that they are mirrored.
+    """
+
+    whose: str
+    frame: str
+    read: np.ndarray | None
+
+
+def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Axes]:
+    """Axes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
+    when they are set right: of the mesh or of the tracker by quarter turns and mirrors; of scans
+    mirrored, in any orientation. Nothing where the LiDAR turned, as it is, does as well."""
+    quarters = Rotation.create_group("O").as_matrix().round()
+    every = np.concatenate([quarters, quarters @ MIRROR])
+    for scans in _sampled(problem, values).values():
+        chosen, frame = _asked(scans), scans[0].scan.stops.rig.lidar_frame
+        start_m = _off_m(chosen, np.eye(3)[None])[0]
+        if start_m < NEAR_M or _best_turn(scans) is not None:
+            continue
+        for whose in ("mesh", "tracker"):
+            at = (each.read(whose, every, values) for each in chosen)
+            off_m = np.mean([s.off_m(T) for s, T in zip(chosen, at, strict=True)], axis=0)
+            if off_m.min() < NEARER * start_m:
+                read = every[np.argmin(off_m)]
+                yield Axes(whose, frame, read.T if whose == "mesh" else read)
+                break
+        else:
+            if _best_turn(scans, MIRROR) is not None:
+                yield Axes("scans", frame, None)
 
 
 @dataclass(frozen=True)
@@ -111,35 +146,79 @@ class _Sampled:
     scan: ScanStop
     T: np.ndarray
 
-    def off_m(self, turns: np.ndarray) -> np.ndarray:
-        """Mean error (G,) of some beams with the LiDAR turned (G, 3, 3) about its origin."""
+    def turned(self, turns: np.ndarray) -> np.ndarray:
+        """T_reference_lidar (G, 4, 4) with the LiDAR turned, or mirrored, (G, 3, 3) about its
+        origin."""
+        return self.T @ _maps(turns)
+
+    def read(self, whose: str, axes: np.ndarray, values: Values) -> np.ndarray:
+        """The same (G, 4, 4) with other axes (G, 3, 3): of the mesh, into which they lead, or of
+        the world that bodies are tracked in."""
+        outer = self.scan.stops.reference
+        if whose == "mesh" or outer is None:
+            return _maps(axes) @ self.T
+        T_world_reference = values[outer]
+        return se3.inverse(T_world_reference) @ _maps(axes) @ T_world_reference @ self.T
+
+    def off_m(self, at: np.ndarray) -> np.ndarray:
+        """Mean error (G,) of some beams, of maps (G, 4, 4) from the LiDAR's frame to the mesh's."""
         _, ray = self.scan.store.read(self.scan.index)
         some = np.linspace(0, len(ray.range_m) - 1, BEAMS_A_SCAN).round().astype(int)
-        origin = (ray.origin_m[some] @ turns.mT).reshape(-1, 3)
-        direction = (ray.direction[some] @ turns.mT).reshape(-1, 3)
-        beams = Beams(origin, direction, np.tile(ray.range_m[some], len(turns)))
-        met = self.scan.meeting.associate(self.T, beams, {}, near_edges=False)
-        surface = self.scan.meeting.meet(self.T, beams, {}, met)
+        linear = at[:, :3, :3].mT
+        origin = ray.origin_m[some] @ linear + at[:, None, :3, 3]
+        direction = ray.direction[some] @ linear
+        range_m = np.tile(ray.range_m[some], len(at))
+        beams, here = Beams(origin.reshape(-1, 3), direction.reshape(-1, 3), range_m), np.eye(4)
+        met = self.scan.meeting.associate(here, beams, {}, near_edges=False)
+        surface = self.scan.meeting.meet(here, beams, {}, met)
         off_m = np.where(
             surface.usable, np.abs(beams.range_m - surface.predicted_m), FARTHEST_OFF_M
         )
-        return np.minimum(off_m, FARTHEST_OFF_M).reshape(len(turns), -1).mean(axis=1)
+        return np.minimum(off_m, FARTHEST_OFF_M).reshape(len(at), -1).mean(axis=1)
 
 
-def _best_turn(scans: Sequence[_Sampled]) -> np.ndarray | None:
-    """The turn (3, 3) of a LiDAR that makes its beams fit best; None where none is much better."""
+def _maps(linear: np.ndarray) -> np.ndarray:
+    """Linear maps (G, 3, 3) as (G, 4, 4)."""
+    out = np.tile(np.eye(4), (len(linear), 1, 1))
+    out[:, :3, :3] = linear
+    return out
+
+
+def _sampled(
+    problem: Problem, values: Mapping[str, np.ndarray]
+) -> dict[tuple[str, int], list[_Sampled]]:
+    """The scans of each LiDAR that a mesh shows, by the unknown that turns its frame."""
+    seen: dict[tuple[str, int], list[_Sampled]] = {}
+    for scan in problem.scans:
+        edge = _free_edge(problem, scan)
+        if edge and isinstance(scan.meeting, MeshSurface):
+            seen.setdefault(edge, []).append(_Sampled(scan, scan.pose(values)))
+    return seen
+
+
+def _asked(scans: Sequence[_Sampled]) -> list[_Sampled]:
+    """Some of the scans, spread evenly."""
     chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS_ASKED).round().astype(int))
+    return [scans[i] for i in chosen]
 
-    def off_m(turns: np.ndarray) -> np.ndarray:
-        return np.mean([scans[i].off_m(turns) for i in chosen], axis=0)
 
-    start_m = float(off_m(np.eye(3)[None])[0])
+def _off_m(scans: Sequence[_Sampled], turns: np.ndarray) -> np.ndarray:
+    """Mean error (G,) of the beams of all, with the LiDAR turned (G, 3, 3)."""
+    return np.mean([each.off_m(each.turned(turns)) for each in scans], axis=0)
+
+
+def _best_turn(scans: Sequence[_Sampled], of: np.ndarray | None = None) -> np.ndarray | None:
+    """The turn (3, 3) of a LiDAR that makes its beams fit best, after they were mirrored, say, by
+    `of` (3, 3); None where none is much better than all as it is."""
+    chosen, of = _asked(scans), np.eye(3) if of is None else of
+    start_m = float(_off_m(chosen, np.eye(3)[None])[0])
     if start_m < NEAR_M:
         return None
     turns = _beside(Rotation.create_group("O").as_matrix(), STEP_RAD * np.arange(-2, 3))
     for step in FINER_RAD:
-        turns = _beside(turns[np.argsort(off_m(turns))[:BEST]], step * np.arange(-1, 2))
-    found_m = off_m(turns)
+        best = np.argsort(_off_m(chosen, turns @ of))[:BEST]
+        turns = _beside(turns[best], step * np.arange(-1, 2))
+    found_m = _off_m(chosen, turns @ of)
     return turns[np.argmin(found_m)] if found_m.min() < NEARER * start_m else None
 
 

@@ -8,9 +8,13 @@ import shutil
 import sys
 
 import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
+from calib import fit
 from calib.cli import main
+from calib.results.check import check
 from calib.rig import load_rig
 from calib.simulation import Spec, simulate
 from sensors.recording import read_table, write_table
@@ -234,6 +238,25 @@ def test_a_copy_of_a_recording_is_refused(rec, refused):
     shutil.copytree(rec, rec.parent / "copy")
     sentence = refused("fit", rec, rec.parent / "copy", "-o", rec.parent / "run")
     assert "rec and " in sentence and "copy hold the same measurements" in sentence
+
+
+def test_a_stop_that_is_there_twice_is_refused_and_told(rec, refused):
+    """Under another name and at another time; but not where the scans differ: several may be made
+    at one pose, which was measured once. That `check` tells all the same."""
+    stops = pd.read_csv(rec / "stops.csv", dtype=str)
+    again = stops[:2].assign(stop=["again", "once_more"])
+    pd.concat([stops, again.assign(time_s="99999")]).to_csv(rec / "stops.csv", index=False)
+    for old, new in zip(stops["stop"], again["stop"], strict=False):
+        shutil.copy(rec / "scans" / f"{old}.parquet", rec / "scans" / f"{new}.parquet")
+    sentence = refused("fit", rec, "-o", rec.parent / "run")
+    assert "again, once_more repeat other stops (again is L00P00 again)" in sentence
+    for k, new in enumerate(again["stop"]):
+        other = sorted((rec / "scans").glob("L0*.parquet"))[k + 2]
+        table = pq.read_table(other).slice(1)
+        pq.write_table(table, rec / "scans" / f"{new}.parquet")
+    fit([rec], rec.parent / "run", hold_out="none")
+    (odd,) = (each for each in check(rec).odd if "to every digit" in each)
+    assert "again of L00P00, once_more of L00P01" in odd
 
 
 def test_scans_that_two_recordings_hold_are_refused(rec, refused):

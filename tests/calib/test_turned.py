@@ -3,6 +3,10 @@
 import shutil
 
 import numpy as np
+import open3d as o3d
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
@@ -16,7 +20,7 @@ from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.solve.fit import solve
-from calib.solve.turned import lidars_turned
+from calib.solve.turned import axes_of, lidars_turned
 from chains import se3
 
 from ..worlds import World, write
@@ -85,6 +89,74 @@ def test_a_lidar_that_is_elsewhere_is_not_turned(good, tmp_path):
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
     problem = problem_of(folder)
     assert lidars_turned(problem, problem.initial) == {}
+
+
+Z_DOWN = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # x, y, z are written as x, z, -y: y is up
+MIRRORED = np.diag([1, -1, 1])
+
+
+def scans(folder, axes):
+    for path in (folder / "scans").glob("*.parquet"):
+        table = pq.read_table(path)
+        xyz = np.column_stack([table[axis] for axis in "xyz"]) @ axes.T
+        for k, axis in enumerate("xyz"):
+            at = table.column_names.index(axis)
+            table = table.set_column(at, axis, pa.array(xyz[:, k].astype(np.float32)))
+        pq.write_table(table, path)
+
+
+def mesh(folder, axes):
+    (path,) = (folder / "reference").glob("*.ply")
+    found = o3d.io.read_triangle_mesh(str(path))
+    faces = np.asarray(found.triangles)
+    found.vertices = o3d.utility.Vector3dVector(np.asarray(found.vertices) @ axes.T)
+    found.triangles = o3d.utility.Vector3iVector(
+        faces if np.linalg.det(axes) > 0 else faces[:, ::-1]
+    )
+    o3d.io.write_triangle_mesh(str(path), found)
+
+
+def bodies(folder, axes):
+    stops = pd.read_csv(folder / "stops.csv")
+    for body in ("base_markers", "mount_markers"):
+        xyz = [f"{body}.{axis}" for axis in "xyz"]
+        q = [f"{body}.q{part}" for part in "xyzw"]
+        stops[xyz] = stops[xyz].to_numpy() @ axes.T
+        turn = Rotation.from_matrix(axes) * Rotation.from_quat(stops[q].to_numpy())
+        stops[q] = turn.as_quat()
+    stops.to_csv(folder / "stops.csv", index=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "axes", "whose", "said"),
+    [
+        (scans, MIRRORED, "scans", "x and y exchanged"),
+        (scans, MIRRORED[[1, 0, 2]] * [1, -1, 1], "scans", "x and y exchanged"),
+        (
+            mesh,
+            Z_DOWN @ MIRRORED,
+            "mesh",
+            "x, z, y of the mesh's vertices in place of x, y, z: are they",
+        ),
+        (mesh, Z_DOWN, "mesh", "x, -z, y of the mesh's vertices in place of x, y, z: is another"),
+        (bodies, Z_DOWN, "tracker", "x, -z, y of the bodies' poses in place of x, y, z: is anoth"),
+    ],
+)
+def test_axes_that_were_exchanged_or_mirrored_are_told(good, tmp_path, change, axes, whose, said):
+    folder = shutil.copytree(good, tmp_path / "other")
+    change(folder, axes)
+    problem = problem_of(folder)
+    (found,) = axes_of(problem, problem.initial)
+    assert (found.whose, found.frame) == (whose, lidar(folder))
+    assert found.read is None or np.array_equal(found.read @ axes, np.eye(3))
+    assert any(said in sentence for sentence in check(folder).odd)
+
+
+def test_axes_are_as_they_should_be_where_something_else_is_wrong(good, shared, tmp_path):
+    exchanged = shared / "recordings" / "known_exchanged_scans"
+    for folder in (good, exchanged, turned(good, tmp_path / "turned", QUARTERS[1])[0]):
+        problem = problem_of(folder)
+        assert list(axes_of(problem, problem.initial)) == []
 
 
 @pytest.mark.long
