@@ -13,7 +13,7 @@ import numpy as np
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
-from calib.diagnosis.candidates import covariates, finer, known_effects, structure
+from calib.diagnosis.candidates import finer, known_effects
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_serial
@@ -21,6 +21,7 @@ from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
+from calib.diagnosis.structure import covariates, of_look, singly, structure
 from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.linear.layout import Layout
 from calib.problem import Problem
@@ -129,7 +130,7 @@ class Stand:
         chance = [e for e in known if e.by_chance]
         named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
         named = screen(scores, named, at)
-        rest = screen(scores, unnamed, at, named.common if named.candidates else None)
+        rest = screen(scores, *singly(unnamed, of_rigs), named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
         values = chances(scores, chance, of_rigs)
         # Where beams are noisier than stated, the mean of those of a stop scatters more as well.
@@ -321,11 +322,13 @@ class Look:
     def judged(self, candidate: Candidate, progress: Progress) -> ScoreTest:
         """A candidate's test with its clusters jackknifed: see `jackknife`."""
         stand, found = self.stand, candidate.test
-        names = [n for n, at in self.named.scores.at.items() if at.start in found.columns]
-        away = away_from_model(self.linear, names) @ found.whiten
+        every = {n: np.isin(np.r_[at], found.columns) for n, at in self.named.scores.at.items()}
+        its = {name: there for name, there in every.items() if there.any()}
+        away = away_from_model(self.linear, list(its))[:, np.concatenate([*its.values()])]
+        away = away @ found.whiten
         wide, shares = stand.problem, Shares()
         if wide.scans:
-            wide = stand.problem_of(stand.model.plus((candidate.effect,)))
+            wide = stand.problem_of(stand.model.plus((of_look(candidate.effect),)))
 
         def tell(done: int, total: int) -> None:
             progress("fitting the candidates", done, total)

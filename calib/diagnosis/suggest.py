@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.candidates import Binned, JointShape
 from calib.diagnosis.screen import Candidate
+from calib.diagnosis.structure import Binned, DirectionShape, JointShape, RingSlope
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
 from chains.errors import InputError
@@ -66,6 +66,12 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     if isinstance(effect, JointShape):
         basis = [f"{f}({m} * {effect.other})" for m in (1, 2, 3) for f in ("sin", "cos")]
         rest = {"site": f"joint:{effect.joint}", "unit": "rad", "sigma": 0.003, "basis": basis}
+    elif isinstance(effect, DirectionShape):
+        rest = {"site": effect.what, "unit": "rad", "sigma": 0.003, "basis": effect.waves()}
+    elif isinstance(effect, RingSlope):
+        column, (middle, half) = effect.column, effect.scale
+        basis = [f"(ring == {effect.ring}) * ({column} - {middle:.9g}) / {half:.9g}"]
+        rest = {"site": "range", "unit": "m", "sigma": 0.01, "basis": basis}
     elif isinstance(effect, Binned) and "label" not in effect.covariates:
         sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
         basis = sides[0]
@@ -74,7 +80,11 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
         rest = {"site": "range", "unit": "m", "sigma": 0.01, "basis": basis}
     else:
         return None
-    bare = (c.removesuffix("_rad").removesuffix("_m") for c in hangs_on(effect))
+    bare = [c.removesuffix("_rad").removesuffix("_m") for c in hangs_on(effect)]
+    if isinstance(effect, DirectionShape):
+        bare = [effect.what, "by", *bare]
+    elif isinstance(effect, RingSlope):
+        bare = [f"ring_{effect.ring:03d}", effect.column]
     name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
     numbered = (f"{name}_{i}" for i in count(2))
     name = name if name not in taken else next(n for n in numbered if n not in taken)
@@ -87,7 +97,7 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     return found
 
 
-def seen(effect: Binned | JointShape) -> str:
+def seen(effect: Binned | DirectionShape | JointShape | RingSlope) -> str:
     """From where to where each covariate of structure went, in words."""
     suffix = "_rad" if isinstance(effect, JointShape) else ""
     return " and ".join(span(name, *ends, suffix) for name, ends in effect.seen.items())

@@ -28,7 +28,7 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
-from calib.solve.turned import Axes, axes_of, lidars_turned
+from calib.solve.turned import OtherAxes, axes_of, lidars_turned
 from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
@@ -257,7 +257,7 @@ def _turned(scan: ScanStop, before: Values, after: Values) -> Suspect:
     )
 
 
-def _other_axes(found: Axes) -> str:
+def _other_axes(found: OtherAxes) -> str:
     """That coordinates want to be read with other axes."""
     if found.read is None:
         return (

@@ -101,7 +101,7 @@ def lidars_turned(problem: Problem, values: Mapping[str, np.ndarray]) -> Values:
     }
 
 
-class Axes(NamedTuple):
+class OtherAxes(NamedTuple):
     """Coordinates that fit when they are read with other axes.
 
     Args:
@@ -116,8 +116,8 @@ class Axes(NamedTuple):
     read: np.ndarray | None
 
 
-def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Axes]:
-    """Axes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
+def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[OtherAxes]:
+    """OtherAxes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
     when they are set right: of the mesh or of the tracker by quarter turns and mirrors; of scans
     mirrored, in any orientation. Nothing where the LiDAR turned, as it is, does as well."""
     quarters = Rotation.create_group("O").as_matrix().round()
@@ -132,11 +132,11 @@ def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Axes
             off_m = np.mean([s.off_m(T) for s, T in zip(chosen, at, strict=True)], axis=0)
             if off_m.min() < NEARER * start_m:
                 read = every[np.argmin(off_m)]
-                yield Axes(whose, frame, read.T if whose == "mesh" else read)
+                yield OtherAxes(whose, frame, read.T if whose == "mesh" else read)
                 break
         else:
             if _best_turn(scans, MIRROR) is not None:
-                yield Axes("scans", frame, None)
+                yield OtherAxes("scans", frame, None)
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from calib.diagnosis.candidates import STOPS_A_BIN
 from calib.diagnosis.stand import Stand
+from calib.diagnosis.structure import STOPS_A_BIN
 from calib.forward import Values
 from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES

@@ -10,13 +10,14 @@ from calib.blunders import told
 from calib.blunders.judged import Blunder
 from calib.blunders.lasting import lasting, told_once
 from calib.blunders.reach import FurthestMoved
-from calib.diagnosis.candidates import PoseShape, concerned, lacking
+from calib.diagnosis.candidates import concerned, lacking
 from calib.diagnosis.chance.serial import ALPHA_SERIAL, drifting
 from calib.diagnosis.rejects import FEWEST_STOPS, Rejects
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import Search
 from calib.diagnosis.search.confirmed import ALPHA_UNNAMED, suspects
 from calib.diagnosis.stand import Look
+from calib.diagnosis.structure import ring_of, what_moves
 from calib.diagnosis.suggest import formula, hangs_on
 from calib.diagnosis.verdict.candidates import candidate_documents
 from calib.diagnosis.verdict.curves import Curve, curves
@@ -323,7 +324,8 @@ def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> 
         "p_adjusted": candidate.p_adjusted,
         "formula": formula(candidate, taken),
         "seen": {name: list(ends) for name, ends in candidate.effect.seen.items()},
-        "moves": candidate.effect.what if isinstance(candidate.effect, PoseShape) else None,
+        "moves": what_moves(candidate.effect),
+        "ring": ring_of(candidate.effect),
     }
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.candidates import Binned
 from calib.diagnosis.screen import Screen
+from calib.diagnosis.structure import Binned
 from calib.linear.binned import BinnedMean, TwoWay
 
 

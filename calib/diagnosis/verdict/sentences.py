@@ -17,13 +17,15 @@ from calib.results.holdout import TAKEN_BACK, from_to
 
 UNNAMED, BAD = "unexplained_structure", "bad_data"
 MOST_LISTED = 6  # untestable effects and rivals that a sentence names
-# What moves, by what `diagnosis.json` calls it, as a sentence names it.
+# What moves, by what `diagnosis.json` calls it, as a sentence says it.
 WHAT_MOVES = {
-    "mount": "the mount",
-    "lidar": "the LiDAR on its mount",
-    "body": "the tracked body beyond the arm",
-    "base": "the tracked body before the arm",
-    "tracker": "the tracker, or the place where the base stands,",
+    "mount": "the mount moved",
+    "lidar": "the LiDAR moved on its mount",
+    "body": "the tracked body beyond the arm moved",
+    "base": "the tracked body before the arm moved",
+    "tracker": "the tracker moved, or the place where the base stands",
+    "elevation": "beams pointed higher or lower than they should",
+    "azimuth": "beams pointed to the side of where they should",
 }
 LONGEST_FORM = 60  # letters of another form that a sentence has
 
@@ -137,8 +139,10 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     """Of residual structure."""
     out = []
     for each in unexplained[:2]:
-        what = " and ".join(words(c) for c in each["covariates"])
-        moves = f", as if {WHAT_MOVES[each['moves']]} moved" if each.get("moves") else ""
+        ring, on = each.get("ring"), each["covariates"]
+        what = " and ".join(words(c) for c in on if c != "ring" or ring is None)
+        what += "" if ring is None else f", in ring {ring} alone"
+        moves = f", as if {WHAT_MOVES[each['moves']]}" if each.get("moves") else ""
         out.append(
             f"The residual structure depends on {what}{moves}: {each['rms_mm']:.2f} mm rms of "
             f"{residual}."

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from calib.diagnosis.candidates import PoseShape
 from calib.diagnosis.formulas import Formula, find
 from calib.diagnosis.formulas.found import bare
 from calib.diagnosis.formulas.why import why
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand, tried
+from calib.diagnosis.structure import what_moves
 from calib.diagnosis.suggest import DESCRIBES, span, what_differs, words
 from calib.diagnosis.verdict.matters import FALL_MATTERS, HELD_OUT_BY_CHANCE, as_good
 from calib.effects import Effect, Site
@@ -76,7 +76,7 @@ def unnamed(
         progress: as of `fit.solve`.
     """
     leading = next(iter(found.at_first or found.unnamed), None)
-    moves = leading is not None and isinstance(leading.effect, PoseShape)
+    moves = leading is not None and what_moves(leading.effect) is not None
     if moves and unseen is None:
         return Unnamed()
     names = [step.effect for step in found.found]

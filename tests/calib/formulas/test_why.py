@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from calib.diagnosis.candidates import PoseShape
 from calib.diagnosis.formulas.factors import NOT_COVARIATES
 from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOINT, WHY_OTHER, why
+from calib.diagnosis.structure import PoseShape
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
