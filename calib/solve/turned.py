@@ -117,7 +117,7 @@ class OtherAxes(NamedTuple):
 
 
 def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[OtherAxes]:
-    """OtherAxes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
+    """Axes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
     when they are set right: of the mesh or of the tracker by quarter turns and mirrors; of scans
     mirrored, in any orientation. Nothing where the LiDAR turned, as it is, does as well."""
     quarters = Rotation.create_group("O").as_matrix().round()
