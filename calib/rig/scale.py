@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from calib.rig import TargetSpec
 from calib.rig.suspect import Suspect, listed
@@ -18,6 +19,7 @@ from sensors.stops import Targets
 # A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
 APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
+UPWARDS = 0.9  # a choice, of the cosine: scanners are level to a degree, and have z up
 SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
 # In a metre.
 LENGTH_UNITS = {
@@ -53,7 +55,16 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
     there_m = se3.apply(T_world_reference, targets.faro_m)
     off_m = np.linalg.norm(sphere_m - there_m, axis=1)
     differing = _ratio(sphere_m, there_m, spec)
-    if differing is not None and not askew.any():
+    if off_m.max() < APART_M and (T_world_reference[:3, :3].T @ down)[2] > UPWARDS:
+        yield (
+            "by upper and lower of targets.csv the rods stand upwards in the scanner's frame; are "
+            "these two exchanged?"
+        )
+    if off_m.max() > APART_M and (order := _renumbered(sphere_m, targets.faro_m)) is not None:
+        other = np.flatnonzero(order != np.arange(len(order)))
+        pairs = ", ".join(f"{names[order[k]]} is {names[k]}" for k in other)
+        yield f"the scanner numbers targets otherwise than the tracker does: its {pairs}"
+    elif differing is not None and not askew.any():
         yield differing
     elif off_m.max() > APART_M:
         said = (
@@ -62,6 +73,17 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
         )
         size_m = float(off_m.max())
         yield Suspect("target", str(names[off_m.argmax()]), said, size=size_m, unit="m")
+
+
+def _renumbered(tracked_m: np.ndarray, scanned_m: np.ndarray) -> np.ndarray | None:
+    """Which of the spheres of a scanner (M, 3) m is each of a tracker (M, 3) m, by its distances to
+    all others; None where the spheres then still lie apart."""
+    each = [np.linalg.norm(x[:, None] - x, axis=2) for x in (tracked_m, scanned_m)]
+    one, other = (np.sort(distances_m, axis=1) for distances_m in each)
+    order = linear_sum_assignment(np.linalg.norm(one[:, None] - other, axis=2))[1]
+    T, _ = align_points(tracked_m, scanned_m[order])
+    off_m = np.linalg.norm(tracked_m - se3.apply(T, scanned_m[order]), axis=1)
+    return order if off_m.max() < APART_M else None
 
 
 def _ratio(tracked_m: np.ndarray, scanned_m: np.ndarray, spec: TargetSpec) -> Suspect | None:

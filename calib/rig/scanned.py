@@ -18,6 +18,7 @@ from sensors.rings import RingFinding, odd_rings, ring_elevations
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
 DOUBLED = 1 / 3  # a choice: of points by chance none repeats another; of a copy half do
 PRIMES = (2, 3, 5, 7)  # by whose roots columns are added up: no two rows come to one number
+FLOAT32 = 4e-7  # relative error of a length whose coordinates are such numbers
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
 
 
@@ -36,6 +37,7 @@ class ScanSums:
         darkest: the least intensity.
         doubled: scans of which more than a third of the points are there once more.
         rounded: scans more than half of whose spreads are 0, see `spread_known`.
+        rounded_m: scan -> the step that all its ranges are multiples of, where they are.
         reach_m: the largest distance below which nineteen in twenty returns of a scan lie.
         contents: (column, digest of its values) -> the scans that hold it, of columns that vary;
             "points" stands for x, y and z.
@@ -51,6 +53,7 @@ class ScanSums:
     darkest: float = np.inf
     rounded: list[str] = field(default_factory=list)
     doubled: list[str] = field(default_factory=list)
+    rounded_m: dict[str, float] = field(default_factory=dict)
     reach_m: float = 0.0
     contents: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
@@ -71,6 +74,8 @@ class ScanSums:
             self.elevation_rad += np.bincount(scan.ring, up_rad, len(self.elevation_rad))
         away_m = np.linalg.norm(scan.xyz_m, axis=1)
         self.reach_m = max(self.reach_m, float(np.quantile(away_m, 0.95)))
+        if step_m := step_of(away_m):
+            self.rounded_m[name] = step_m
         self.columns |= dict.fromkeys(scan.extra)
         if np.isfinite(scan.intensity).any():
             self.intensity[name] = float(np.nanmax(scan.intensity))
@@ -89,6 +94,20 @@ class ScanSums:
             if len(np.unique(values[:1000])) >= LEAST_VALUES:
                 key = column, hashlib.sha256(np.ascontiguousarray(values)).hexdigest()
                 self.contents.setdefault(key, []).append(name)
+
+
+def step_of(values: np.ndarray) -> float:
+    """The step of which values (N,), as float32 has them, are multiples; 0 where they are not."""
+    apart, least = np.diff(np.unique(values)), FLOAT32 * float(np.max(values, initial=0.0))
+    apart = apart[apart > least]
+    if len(apart) < LEAST_VALUES:
+        return 0.0
+    step, above = float(apart.min()), np.sort(values) - np.min(values)
+    for far in above[np.searchsorted(above, step * np.geomspace(1, above[-1] / step, 40)) - 1]:
+        step = far / np.rint(far / step) if far > step / 2 else step  # known better the further
+    off = np.abs(above / step - np.rint(above / step)) * step
+    # Of values by chance, steps as small as float32 can tell have no meaning.
+    return float(f"{step:.3g}") if step > 100 * least and off.max() < step / 10 else 0.0
 
 
 def _alike(rows: np.ndarray) -> float:
@@ -135,6 +154,7 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
             f"points of {listed(scans.doubled)} are there twice, and would count as independent; "
             "were they recorded twice?"
         )
+    yield from _coarse(scans, rig.lidar)
     if scans.rounded:
         yield (
             f"more than half of range_std_m is 0 at {listed(scans.rounded)}, so it is not used "
@@ -148,6 +168,17 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
 def numbering(scans: ScanSums) -> RingFinding | None:
     """How rings are numbered otherwise than their LiDAR's model has it, if they are."""
     return odd_rings(scans.lidar, ring_elevations(scans.elevation_rad, scans.rings))
+
+
+def _coarse(scans: ScanSums, lidar: LidarModel) -> Iterator[str]:
+    """Ranges that were rounded to more than the LiDAR's noise, and than its model knows."""
+    known_m = max(lidar.sigma_range_m, lidar.quantum_m)
+    if coarse := [name for name, step_m in scans.rounded_m.items() if step_m > known_m]:
+        step_m = scans.rounded_m[coarse[0]]
+        yield (
+            f"ranges are multiples of {1e3 * step_m:.3g} mm at {listed(coarse)}, more than the "
+            f"LiDAR's noise; 'quantum_m: {step_m:g}' under 'lidar' in rig.yaml says so"
+        )
 
 
 def _at_once(recording: RecordedStops) -> Iterator[str]:

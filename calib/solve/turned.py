@@ -35,6 +35,9 @@ NEAR_M = 0.1  # mean error of these beams that asks for no other orientation: go
 # Of the mean error, what another orientation may have at most: a choice, between good ones' 0.02 m
 # and the 0.1 m from which one is asked for.
 NEARER = 0.5
+# Mean error, at most, with other axes: 0.02 m of good beams, 0.1 m as a tenth of them are 1 m off,
+# and some to spare. A room with floor and ceiling 0.3 m too low has 0.26 m as a mirror shows it.
+FITS_M = 0.2
 MIRROR = np.diag([1.0, -1.0, 1.0])  # any other follows by turns
 
 Values = dict[str, np.ndarray]
@@ -130,7 +133,7 @@ def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Othe
         for whose in ("mesh", "tracker"):
             at = (each.read(whose, every, values) for each in chosen)
             off_m = np.mean([s.off_m(T) for s, T in zip(chosen, at, strict=True)], axis=0)
-            if off_m.min() < NEARER * start_m:
+            if off_m.min() < min(NEARER * start_m, FITS_M):
                 read = every[np.argmin(off_m)]
                 yield OtherAxes(whose, frame, read.T if whose == "mesh" else read)
                 break

@@ -16,7 +16,7 @@ from calib.results.check import check
 from calib.rig import load_rig
 from calib.rig.recording import Recording
 from calib.rig.scale import odd_mesh, odd_targets
-from calib.rig.scanned import ScanSums, odd_scans
+from calib.rig.scanned import ScanSums, odd_scans, step_of
 from calib.rig.tracked import odd_bodies
 from calib.show.tables import print_check
 from sensors.recording import read_scan
@@ -295,8 +295,48 @@ def test_lengths_that_differ_between_tracker_and_scanner(sound, factor, words):
         assert words in only(found).sentence and only(found).name == "scale"
     swapped = targets.faro_m[[1, 0, *range(2, len(targets.names))]]
     if words is None:
+        names = targets.names
         found = only(odd_targets(replace(targets, faro_m=swapped), rig.target))
-        assert "is it the same target" in found.sentence
+        assert f"its {names[1]} is {names[0]}, {names[0]} is {names[1]}" in found
+
+
+def test_targets_that_both_number_otherwise(sound):
+    """Or of which one lies elsewhere, which no other order sets right."""
+    rig, recording = sound
+    targets, order = recording.targets, np.roll(np.arange(len(recording.targets.names)), 1)
+    found = only(odd_targets(replace(targets, faro_m=targets.faro_m[order]), rig.target))
+    assert found.startswith("the scanner numbers targets otherwise than the tracker does: its ")
+    here = [targets.names[k] for k in np.argsort(order)]  # where the scanner has each of them now
+    assert all(f"{b} is {a}" in found for a, b in zip(targets.names, here, strict=True))
+    moved = targets.faro_m.copy()
+    moved[0] += [0.5, 0.0, 0.0]
+    found = only(odd_targets(replace(targets, faro_m=moved), rig.target))
+    assert found.name == targets.names[0] and "is it the same target" in found.sentence
+
+
+def test_markers_that_are_exchanged_on_all_rods(sound):
+    rig, recording = sound
+    rods = recording.targets
+    upside_down = replace(rods, upper_m=rods.lower_m, lower_m=rods.upper_m)
+    assert "upper and lower" in only(odd_targets(upside_down, rig.target))
+
+
+@pytest.mark.parametrize("step_m", [0.0, 0.002, 0.004, 0.02])
+def test_ranges_that_were_rounded(shared, step_m):
+    """As float32 holds their points: the step is found, and told where it is more than noise."""
+    rng = np.random.default_rng(1)
+    range_m = rng.uniform(0.5, 9.0, 5000)
+    if step_m:
+        range_m = step_m * np.round(range_m / step_m)
+    way = rng.normal(size=(5000, 3))
+    points = (range_m[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)).astype("f4")
+    assert step_of(np.linalg.norm(points, axis=1)) == pytest.approx(step_m, rel=1e-3)
+    rig, recording = opened(shared, "known_nothing_hidden")
+    scans = ScanSums(rig.lidar, points={"L00P00": 1}, rounded_m={"L00P00": step_m})
+    scans.rings[:] = 1
+    told = [odd for odd in odd_scans(rig, recording, scans) if "multiples" in str(odd)]
+    known_m = max(rig.lidar.sigma_range_m, rig.lidar.quantum_m)
+    assert len(told) == (step_m > known_m) and all(f"{1e3 * step_m:g} mm" in t for t in told)
 
 
 @pytest.mark.parametrize(
