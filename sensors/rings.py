@@ -29,8 +29,10 @@ model's: 14 units of Hesai and Ouster among these lie 0.94 steps at most from th
 has rings out of order."""
 _LISTED = 3
 """Exchanged rings that a sentence names: a choice."""
+_UNIT_RAD, _UNIT_STEPS = np.radians(1.2), 2.4
+"""Within either, the angles of those units lie beside the table of their model."""
 _FOREIGN_RAD, _FOREIGN_STEPS = np.radians(2.0), 4.0
-"""Beyond both, elevations are of no model known; units are off by 1.2 deg or 2.4 steps at most."""
+"""Beyond both, elevations are of no model known."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def odd_rings(lidar: LidarModel, elevation_rad: ArrayLike) -> RingFinding | None
         if (at := at[np.isfinite(table[at])]).size >= _LEAST_RINGS
     ]
     left_rad, found = min(others, key=lambda other: round(other[0], 6))  # the first of equals
-    if left_rad > _EXPLAINED * off_rad:
+    if left_rad > min(_EXPLAINED * off_rad, found.get("left", np.inf)):
         exchanged = _exchanged(lidar, seen, rings)
         if exchanged is not None:
             return exchanged
@@ -165,9 +167,10 @@ def _numberings(lidar: LidarModel) -> Iterator[tuple[Array, dict]]:
         other = load_lidar(name).elevation_rad
         if name == lidar.name or (len(other) == len(table) and np.allclose(other, table)):
             continue
-        said = f"are those of {name}"
-        yield other, {"what": "model", "model": name, "said": said}
-        yield other[::-1], {"what": "model", "model": name, "said": f"{said} from the other end"}
+        said, step = f"are those of {name}", np.median(np.diff(np.sort(other)))
+        how = {"what": "model", "model": name, "left": max(_UNIT_RAD, _UNIT_STEPS * step)}
+        yield other, how | {"said": said}
+        yield other[::-1], how | {"said": f"{said} from the other end"}
 
 
 def _rms(values: Array) -> float:
