@@ -72,7 +72,7 @@ KNOWING_UNKNOWNS = ("forward", "residuals", "problem", "linear", "solve", "resul
 KNOWING_UNKNOWNS += ("diagnosis", "recalibration", "runs", "planning")
 TEXTS = {
     "calib/blunders/told.py": "directions, in sentences",
-    "calib/diagnosis/structure.py": "families of effects, for a formula",
+    "calib/diagnosis/structure/empirical.py": "families of effects, for a formula",
     "calib/diagnosis/formulas/factors.py": "columns",
     "calib/diagnosis/formulas/found.py": "columns, sites and texts of formulas",
     "calib/diagnosis/formulas/seen.py": "sentences",

@@ -10,9 +10,17 @@ from typing import Any
 import numpy as np
 
 from calib.diagnosis.screen import Candidate
-from calib.diagnosis.structure import Binned, DirectionShape, JointShape, RingSlope
+from calib.diagnosis.structure.empirical import (
+    Binned,
+    DirectionShape,
+    JointShape,
+    PoseSlope,
+    RingSlope,
+    middle_and_half,
+)
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
+from calib.effects.rig import DOF
 from chains.errors import InputError
 
 # Of the piecewise linear function that is suggested for one covariate, and of each of two; and of
@@ -69,9 +77,12 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     elif isinstance(effect, DirectionShape):
         rest = {"site": effect.what, "unit": "rad", "sigma": 0.003, "basis": effect.waves()}
     elif isinstance(effect, RingSlope):
-        column, (middle, half) = effect.column, effect.scale
-        basis = [f"(ring == {effect.ring}) * ({column} - {middle:.9g}) / {half:.9g}"]
+        basis = [f"(ring == {effect.only}) * {_sloping(effect)}"]
         rest = {"site": "range", "unit": "m", "sigma": 0.01, "basis": basis}
+    elif isinstance(effect, PoseSlope) and effect.sites:
+        site = effect.sites[effect.only]
+        unit, sigma = ("rad", 0.003) if site.rpartition(".")[2] in DOF[:3] else ("m", 0.003)
+        rest = {"site": site, "unit": unit, "sigma": sigma, "basis": [_sloping(effect)]}
     elif isinstance(effect, Binned) and "label" not in effect.covariates:
         sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
         basis = sides[0]
@@ -84,7 +95,9 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     if isinstance(effect, DirectionShape):
         bare = [effect.what, "by", *bare]
     elif isinstance(effect, RingSlope):
-        bare = [f"ring_{effect.ring:03d}", effect.column]
+        bare = [f"ring_{effect.only:03d}", effect.column]
+    elif isinstance(effect, PoseSlope):
+        bare = [effect.sites[effect.only].removeprefix("tracker:"), "by", effect.column]
     name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
     numbered = (f"{name}_{i}" for i in count(2))
     name = name if name not in taken else next(n for n in numbered if n not in taken)
@@ -97,7 +110,13 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     return found
 
 
-def seen(effect: Binned | DirectionShape | JointShape | RingSlope) -> str:
+def _sloping(effect: RingSlope | PoseSlope) -> str:
+    """The column from -1 to 1 over what was seen of it."""
+    middle, half = middle_and_half(*effect.seen[effect.column])
+    return f"({effect.column} - {middle:.9g}) / {half:.9g}"
+
+
+def seen(effect: Binned | DirectionShape | JointShape | PoseSlope | RingSlope) -> str:
     """From where to where each covariate of structure went, in words."""
     suffix = "_rad" if isinstance(effect, JointShape) else ""
     return " and ".join(span(name, *ends, suffix) for name, ends in effect.seen.items())

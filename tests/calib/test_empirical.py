@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.diagnosis.structure import Binned, JointShape
+from calib.diagnosis.structure.empirical import Binned, JointShape
 from calib.diagnosis.suggest import formula
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run

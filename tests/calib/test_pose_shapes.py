@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.diagnosis.structure import PoseShape, structure
+from calib.diagnosis.structure import structure
+from calib.diagnosis.structure.empirical import PoseShape
 from calib.diagnosis.verdict.sentences import WHAT_MOVES
 from calib.effects import CATALOGUE
 from calib.effects.base import View

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from calib.diagnosis.structure import PoseShape
+from calib.diagnosis.structure.empirical import PoseShape
 from calib.effects import Effect, Param, ShapeStep, Site, find
 from calib.problem import build
 from calib.problem.model import Model, Source

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.diagnosis.screen import Screen
-from calib.diagnosis.structure import Binned
+from calib.diagnosis.structure.empirical import Binned
 from calib.linear.binned import BinnedMean, TwoWay
 
 

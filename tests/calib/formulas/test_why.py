@@ -6,7 +6,7 @@ import pytest
 
 from calib.diagnosis.formulas.factors import NOT_COVARIATES
 from calib.diagnosis.formulas.why import ARM_JOINT, MECHANISMS, OF_ARM, WHY_JOINT, WHY_OTHER, why
-from calib.diagnosis.structure import PoseShape
+from calib.diagnosis.structure.empirical import PoseShape
 from calib.diagnosis.verdict import unnamed as module
 from calib.diagnosis.verdict.unnamed import unnamed
 from calib.effects import CATALOGUE, Site
