@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.score import project, score_test
+from calib.diagnosis.search.confirmed import outdoing
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Stand
 from calib.effects import CATALOGUE
@@ -103,3 +104,12 @@ def test_an_effect_that_is_not_of_joints_has_no_parts(look, name):
     candidate = next(c for c in look.named.candidates if c.effect.family == name)
     part = likeliest_part(look, candidate, 1.0)
     assert (part.statistic, part.dof) == (candidate.test.statistic, candidate.test.dof)
+
+
+def test_effects_that_explain_as_much_as_values_by_chance(look):
+    """The best, and those that the data do not tell from it; none of less than chance explains."""
+    best, *others = look.named.candidates
+    assert outdoing(look, 2 * best.evidence + 1e-9) == []
+    found = outdoing(look, -np.inf)
+    near = [c.effect for c in others if best.evidence - c.evidence < np.log(20)]
+    assert found == [best.effect, *near] and len(near) < len(others)

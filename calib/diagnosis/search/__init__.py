@@ -19,6 +19,7 @@ from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
     judged,
+    outdoing,
     outlasts,
     scattering,
     structures,
@@ -137,6 +138,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     unsettled: Chance | None = None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         others = [c for c in looks[-1].chance if c.found and c is not strongest]
+        as_much = outdoing(looks[-1], strongest.statistic)
         chance.append(strongest)
         widens = strongest.effect.widens
         base = looks[-1].stand if widens else stand
@@ -157,8 +159,10 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
         alike = [*near, *(c for c in others if c.effect.name not in tested)]
-        rivals = tuple(dict.fromkeys(c.effect.name for c in alike))
-        chance[-1] = replace(strongest, rivals=rivals)
+        named = {step.effect.family for step in found}
+        effects = [e for e in as_much if e.family not in named]
+        rivals = dict.fromkeys(e.name for e in (*(c.effect for c in alike), *effects))
+        chance[-1] = replace(strongest, rivals=tuple(rivals))
     last = looks[-1]
     done = Search(
         looks=looks,

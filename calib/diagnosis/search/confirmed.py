@@ -11,7 +11,7 @@ from scipy import special
 from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.score import Scores, ScoreTest, project, score_test
-from calib.diagnosis.screen import Candidate, Screen
+from calib.diagnosis.screen import ODDS, Candidate, Screen
 from calib.diagnosis.stand import Look, variables_of
 from calib.effects import Effect
 from calib.solve.fit import Progress
@@ -76,6 +76,14 @@ def outlasts(look: Look, candidate: Candidate) -> bool:
     explained = np.square(whiten.T @ (scores.score + scores.information @ theta)).sum()
     p = special.chdtrc(whiten.shape[1], explained)
     return float(after_looks(p, candidate.looks)) < ALPHA_EFFECT
+
+
+def outdoing(look: Look, statistic: float) -> list[Effect]:
+    """Effects of the catalogue that explain as much as values by chance do (a log-likelihood ratio,
+    twice), less their parameters, though too few stops, targets or surfaces show them to be named:
+    that which does best, and those near it. They may be what seems to scatter."""
+    found = [c for c in look.named.candidates if 2.0 * c.evidence > statistic]
+    return [c.effect for c in found if found[0].evidence - c.evidence < ODDS]
 
 
 def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
