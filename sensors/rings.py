@@ -30,7 +30,7 @@ has rings out of order."""
 _LISTED = 3
 """Exchanged rings that a sentence names: a choice."""
 _UNIT_RAD, _UNIT_STEPS = np.radians(1.2), 2.4
-"""Within either, the angles of those units lie beside the table of their model."""
+"""Of those 24 units, what the angles of any lie beside the table of its model at most."""
 _FOREIGN_RAD, _FOREIGN_STEPS = np.radians(2.0), 4.0
 """Beyond both, elevations are of no model known."""
 

@@ -57,12 +57,12 @@ class Leverage:
         names = [name for name in layout.outer() if name not in layout.unbounded]
         at = positions(layout.size, layout.kept)[layout.columns(names)]
         block = information[np.ix_(at, at)]
-        ends = np.cumsum([layout.unknowns[name].dim for name in names])
+        ends = dict(zip(names, np.cumsum([layout.unknowns[n].dim for n in names]), strict=True))
         hardware = [name for name in names if layout.unknowns[name].role is Role.CALIBRATION]
         for some, known, _ in priors(layout, hardware, values):
             scaled = known * layout.sigma[layout.columns_of_each(some)][:, None]
             for name, A in zip(some, scaled, strict=True):
-                end = ends[names.index(name)]
+                end = ends[name]
                 block[end - len(A) : end, end - len(A) : end] += (1.0 - widened**-2.0) * A.T @ A
         unit = layout.sigma[layout.columns(names)]
         C = cho_solve(cho_factor(block), np.eye(len(block))) * np.outer(unit, unit)

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.blunders.chance import after_looks
 from calib.diagnosis.score import Scores, ScoreTest, score_test
+from calib.diagnosis.structure.empirical import EachAlone
 from calib.effects import Effect, Site
 
 # Of a rival, within which it can stand in for the best: from 20 to 1 on, evidence is called strong
@@ -103,15 +104,21 @@ def screen(
     if common is None:
         common = _common([(e, tests[e.name]) for some in families.values() for e in some])
     by_chance = _by_chance(scores, tests)
-    least, found = [], []
+    least, found, many = [], [], 0
     for family in families.values():
-        drawn = np.min([by_chance[e.name] for e in family], axis=0)
-        looks = looked(drawn)
-        least.append(after_looks(drawn, looks))
+        drawn, looks = np.min([by_chance[e.name] for e in family], axis=0), float(len(family))
+        p_value = [tests[e.name].p_value() for e in family]
         best = max(family, key=lambda e: tests[e.name].evidence(common))
-        p = min(tests[e.name].p_value() for e in family)
-        found.append((best, after_looks(p, looks), looks))
-    together = looked(np.min(least, axis=0)) if least else 1.0
+        if isinstance(family[0], EachAlone):  # that is judged which chance explains least
+            best = family[int(np.argmin(p_value))]
+        else:
+            looks = looked(drawn)
+        if looks < QUANTILE * len(drawn):
+            least.append(after_looks(drawn, looks))
+        else:  # so few draws cannot tell how small its smallest p-value is
+            many += 1
+        found.append((best, after_looks(min(p_value), looks), looks))
+    together = many + (looked(np.min(least, axis=0)) if least else 0.0) or 1.0
     candidates = [
         Candidate(
             effect=effect,

@@ -130,7 +130,9 @@ class Stand:
         chance = [e for e in known if e.by_chance]
         named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
         named = screen(scores, named, at)
-        rest = screen(scores, *singly(unnamed, of_rigs), named.common if named.candidates else None)
+        felt = np.sqrt(np.maximum(np.diag(scores.whole), 0.0))
+        alone, each = singly(unnamed, of_rigs, felt)
+        rest = screen(scores, alone, each, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
         values = chances(scores, chance, of_rigs)
         # Where beams are noisier than stated, the mean of those of a stop scatters more as well.

@@ -20,7 +20,6 @@ from calib.diagnosis.structure.empirical import (
 )
 from calib.effects import Effect, Site
 from calib.effects.own.formula import FormulaEffect
-from calib.effects.rig import DOF
 from chains.errors import InputError
 
 # Of the piecewise linear function that is suggested for one covariate, and of each of two; and of
@@ -79,10 +78,9 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     elif isinstance(effect, RingSlope):
         basis = [f"(ring == {effect.only}) * {_sloping(effect)}"]
         rest = {"site": "range", "unit": "m", "sigma": 0.01, "basis": basis}
-    elif isinstance(effect, PoseSlope) and effect.sites:
-        site = effect.sites[effect.only]
-        unit, sigma = ("rad", 0.003) if site.rpartition(".")[2] in DOF[:3] else ("m", 0.003)
-        rest = {"site": site, "unit": unit, "sigma": sigma, "basis": [_sloping(effect)]}
+    elif isinstance(effect, PoseSlope) and effect.formulas:
+        site, move = effect.formulas[effect.only]
+        rest = {"site": site, "unit": move.unit, "sigma": move.sigma, "basis": [_sloping(effect)]}
     elif isinstance(effect, Binned) and "label" not in effect.covariates:
         sides = [list(_shapes(c, effect, candidate)) for c in effect.covariates]
         basis = sides[0]
@@ -95,9 +93,9 @@ def formula(candidate: Candidate, taken: Collection[str] = ()) -> dict[str, Any]
     if isinstance(effect, DirectionShape):
         bare = [effect.what, "by", *bare]
     elif isinstance(effect, RingSlope):
-        bare = [f"ring_{effect.only:03d}", effect.column]
+        bare = [f"ring_{effect.only:03d}", *bare[1:]]
     elif isinstance(effect, PoseSlope):
-        bare = [effect.sites[effect.only].removeprefix("tracker:"), "by", effect.column]
+        bare = [rest["site"].removeprefix("tracker:"), "by", *bare]
     name = "_".join(["empirical", *(re.sub(r"\W", "_", c, flags=re.ASCII) for c in bare)])
     numbered = (f"{name}_{i}" for i in count(2))
     name = name if name not in taken else next(n for n in numbered if n not in taken)
@@ -141,6 +139,12 @@ def outward(low: float, high: float) -> list[float]:
     step = 10.0**-digits
     ends = np.floor(low / step) * step, np.ceil(high / step) * step
     return [round(float(end), digits) for end in ends]
+
+
+def in_words(effect: Effect) -> str:
+    """The covariates of structure in a sentence, and the ring where one was tested by itself."""
+    told = " and ".join(words(c) for c in hangs_on(effect))
+    return told.replace("ring", f"ring {effect.only}") if isinstance(effect, RingSlope) else told
 
 
 def hangs_on(effect: Effect) -> tuple[str, ...]:

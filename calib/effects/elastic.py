@@ -90,7 +90,7 @@ class ArmPayloadOffset(Effect):
     def params(self, rig: Rig) -> tuple[Param, ...]:
         tips = rig.tips if "revolute" in rig.joint_kinds else ()
         of = {tip: f"{tip}." if len(tips) > 1 else "" for tip in tips}
-        names = (f"{of[tip]}centre_{axis}" for tip in tips for axis in "xyz")  # no joint's name
+        names = (f"{of[tip]}centre_{axis}" for tip in tips for axis in "xyz")
         return tuple(Param(name, self.unit, 0.2 * SOFT) for name in names)
 
     def basis(self, view: View) -> np.ndarray:

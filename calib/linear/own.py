@@ -23,13 +23,14 @@ Values = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class OwnRows:
-    """Whitened rows of K stops, m of each: by unknowns that stops share, and by each one's own.
+    """Whitened rows in K sets of m, each of one stop, of which there may be several: by unknowns
+    that stops share, and by the stop's own.
 
     Args:
         shared: (K, m, s) derivatives by the unknowns in the columns shared_columns (s,).
         own: (K, m, o) by those in the columns own_columns (K, o).
-        b: (K m,) minus the residuals, stop after stop.
-        stops: (K,) their numbers.
+        b: (K m,) minus the residuals, set after set.
+        stops: (K,) numbers of the stops.
         measured: False for priors.
     """
 
@@ -43,7 +44,7 @@ class OwnRows:
 
     @property
     def of_each(self) -> int:
-        """m, the rows of each stop."""
+        """m, the rows of each set."""
         return self.own.shape[1]
 
     @property
@@ -72,7 +73,7 @@ class OwnRows:
         return self._entries(self.shared, self.own)
 
     def gradients(self) -> tuple[Entries, np.ndarray, np.ndarray]:
-        """``J^T W b`` of each stop; and the stop and place (K,) of each."""
+        """``J^T W b`` of each set; and the stop and place (K,) of each."""
         b = self._of_each(self.b)[:, None]
         entries = self._entries(b @ self.shared, b @ self.own)
         return entries, self.stops, np.full(len(self.stops), -1)

@@ -14,6 +14,9 @@ from calib.rig.inventory import copied
 from calib.rig.suspect import listed
 from chains.errors import InputError
 
+# Of rows of joints and poses that are the same: a choice, as rounded numbers may once agree.
+COINCIDENCES = 1
+
 
 def refuse_given_twice(recordings: Sequence[Path]) -> None:
     """Raise InputError for a folder that is given twice."""
@@ -42,11 +45,13 @@ def all_once(
     """
     found = [_measured(source, each) for source, each in zip(sources, scans, strict=True)]
     for source, mine in zip(sources, found, strict=True):
-        pairs = copied(source.recording).items()
-        if copies := [stop for stop, of in pairs if stop in mine and mine[stop] == mine.get(of)]:
+        pairs = copied(source.recording, unseen=True)
+        copies = [stop for stop, of in pairs.items() if stop in mine and mine[stop] == mine.get(of)]
+        has_scan = dict(zip(source.recording.stops, source.recording.has_scan, strict=True))
+        if len(copies) > COINCIDENCES or any(has_scan[stop] for stop in copies):
             raise InputError(
                 f"{source.recording.folder / 'stops.csv'}: {listed(copies)} repeat other stops "
-                f"({copies[0]} is {dict(pairs)[copies[0]]} again), to every digit of what was "
+                f"({copies[0]} is {pairs[copies[0]]} again), to every digit of what was "
                 "measured; as data they count once, so remove the rows that are copies"
             )
     for (one, mine), (other, theirs) in combinations(zip(sources, found, strict=True), 2):

@@ -185,8 +185,9 @@ def up_of(estimate: Estimate, known: Intervals) -> dict[str, Any] | None:
     g, by_gravity = down(estimate.values[GRAVITY])
     C = by_gravity @ known.over(estimate, [GRAVITY]) @ by_gravity.T
     world, sigma_rad = problem.sources[0].rig.world, float(np.sqrt(np.trace(C) / 2))
-    lean, known = 1e3 * np.arctan2(np.hypot(*g[:2]), -g[2]), 1e3 * sigma_rad
-    told = f"up lies {lean:.2f} mrad off z of '{world}', and is known to {known:.2g} mrad"
+    lean_mrad = 1e3 * np.arctan2(np.hypot(*g[:2]), -g[2])
+    told = f"up lies {lean_mrad:.2f} mrad off z of '{world}', and is known to "
+    told += f"{1e3 * sigma_rad:.2g} mrad"
     return {"frame": world, "xyz": -g, "sigma_rad": sigma_rad, "told": told}
 
 

@@ -183,13 +183,14 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
         )
 
 
-def copied(recording: RecordedStops) -> dict[str, str]:
-    """Stop -> an earlier one with the same joints and the same poses, to every digit."""
+def copied(recording: RecordedStops, unseen: bool = False) -> dict[str, str]:
+    """Stop -> an earlier one with the same joints and the same poses, to every digit; of stops
+    where a body was seen or, if that is asked, of all."""
     poses = np.hstack(list(recording.bodies.values()) or [np.zeros((len(recording.stops), 0))])
     first: dict[bytes, str] = {}
     found = {}
     for stop, joints, pose in zip(recording.stops, recording.joints, poses, strict=True):
-        if np.isfinite(pose).any():
+        if unseen or np.isfinite(pose).any():
             of = first.setdefault(joints.tobytes() + pose.tobytes(), stop)
             found |= {stop: of} if of != stop else {}
     return found

@@ -62,8 +62,8 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
         )
     if off_m.max() > APART_M and (order := _renumbered(sphere_m, targets.faro_m)) is not None:
         other = np.flatnonzero(order != np.arange(len(order)))
-        pairs = ", ".join(f"{names[order[k]]} is {names[k]}" for k in other)
-        yield f"the scanner numbers targets otherwise than the tracker does: its {pairs}"
+        pairs = ", ".join(f"{names[order[k]]} is the tracker's {names[k]}" for k in other)
+        yield f"scanner and tracker number targets otherwise: the scanner's {pairs}"
     elif differing is not None and not askew.any():
         yield differing
     elif off_m.max() > APART_M:

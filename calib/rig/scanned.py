@@ -18,7 +18,7 @@ from sensors.rings import RingFinding, odd_rings, ring_elevations
 FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0: " of 65535"}
 DOUBLED = 1 / 3  # a choice: of points by chance none repeats another; of a copy half do
 PRIMES = (2, 3, 5, 7)  # by whose roots columns are added up: no two rows come to one number
-FLOAT32 = 4e-7  # relative error of a length whose coordinates are such numbers
+FLOAT32 = 4e-7  # of the largest: float32 has 6e-8, and a length has that of three numbers, rounded
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
 
 
@@ -97,7 +97,8 @@ class ScanSums:
 
 
 def step_of(values: np.ndarray) -> float:
-    """The step of which values (N,), as float32 has them, are multiples; 0 where they are not."""
+    """The step of which values (N,), as float32 has them, are multiples; 0 where they are not, or
+    it is less than a hundred times what float32 tells of the largest: 4 mm of 100 m."""
     apart, least = np.diff(np.unique(values)), FLOAT32 * float(np.max(values, initial=0.0))
     apart = apart[apart > least]
     if len(apart) < LEAST_VALUES:
@@ -177,7 +178,7 @@ def _coarse(scans: ScanSums, lidar: LidarModel) -> Iterator[str]:
         step_m = scans.rounded_m[coarse[0]]
         yield (
             f"ranges are multiples of {1e3 * step_m:.3g} mm at {listed(coarse)}, more than the "
-            f"LiDAR's noise; 'quantum_m: {step_m:g}' under 'lidar' in rig.yaml says so"
+            f"LiDAR's noise; if they are, write 'quantum_m: {step_m:g}' under 'lidar' in rig.yaml"
         )
 
 

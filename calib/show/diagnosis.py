@@ -153,6 +153,11 @@ def _fall(candidate: Mapping[str, Any]) -> Iterator[str]:
             yield fall if unit == "mm" else f"{fall} {unit}"
 
 
+def _ring(each: Mapping[str, Any]) -> str:
+    """Of residual structure that one ring shows most, which."""
+    return "ring" if each.get("ring") is None else f"ring {each['ring']}"
+
+
 def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """Structure that no effect accounts for, strongest first."""
     table = columns_table("residual structure over", "p", "mm", "to add it")
@@ -163,7 +168,7 @@ def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -
     for each in unexplained:
         formula = each["formula"]["name"] if each["formula"] else ""
         table.add_row(
-            " x ".join(each["covariates"]),
+            " x ".join(each["covariates"]).replace("ring", _ring(each)),
             small(each["p_adjusted"]),
             _size(each["rms_mm"]),
             formula,

@@ -297,7 +297,10 @@ def test_lengths_that_differ_between_tracker_and_scanner(sound, factor, words):
     if words is None:
         names = targets.names
         found = only(odd_targets(replace(targets, faro_m=swapped), rig.target))
-        assert f"its {names[1]} is {names[0]}, {names[0]} is {names[1]}" in found
+        one, other = names[:2]
+        assert (
+            f"the scanner's {other} is the tracker's {one}, {one} is the tracker's {other}" in found
+        )
 
 
 def test_targets_that_both_number_otherwise(sound):
@@ -305,9 +308,11 @@ def test_targets_that_both_number_otherwise(sound):
     rig, recording = sound
     targets, order = recording.targets, np.roll(np.arange(len(recording.targets.names)), 1)
     found = only(odd_targets(replace(targets, faro_m=targets.faro_m[order]), rig.target))
-    assert found.startswith("the scanner numbers targets otherwise than the tracker does: its ")
+    assert found.startswith("scanner and tracker number targets otherwise: the scanner's ")
     here = [targets.names[k] for k in np.argsort(order)]  # where the scanner has each of them now
-    assert all(f"{b} is {a}" in found for a, b in zip(targets.names, here, strict=True))
+    assert all(
+        f"{b} is the tracker's {a}" in found for a, b in zip(targets.names, here, strict=True)
+    )
     moved = targets.faro_m.copy()
     moved[0] += [0.5, 0.0, 0.0]
     found = only(odd_targets(replace(targets, faro_m=moved), rig.target))

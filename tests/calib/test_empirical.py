@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 import yaml
 
-from calib.diagnosis.structure.empirical import Binned, JointShape
+from calib.diagnosis.structure import formulas_of, of_look, singly
+from calib.diagnosis.structure.empirical import (
+    Binned,
+    DirectionShape,
+    JointShape,
+    PoseSlope,
+    RingSlope,
+)
 from calib.diagnosis.suggest import formula
+from calib.effects import CATALOGUE, View
+from calib.effects.own.formula import FormulaEffect
+from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.simulation import Spec, simulate
@@ -85,6 +95,63 @@ def test_knots_are_told_apart_where_values_are_large():
     effect = Binned({"time_s": (at[1:] + at[:-1]) / 2}, {"time_s": at}, {"time_s": (at[0], at[-1])})
     knots = re.findall(r"1 - \((\d[\d.e+]*) - time_s", " ".join(proposal(effect)["basis"]))
     assert len({float(knot) for knot in knots}) == len(knots) == 7
+
+
+@pytest.mark.parametrize("what", ["elevation", "azimuth", "ring", "lidar", "body"])
+def test_a_formula_does_what_it_stands_for(tmp_path, what):
+    """Site, unit and scale: the same basis, a parameter that a test found alone by itself."""
+    simulate("tiny", tmp_path / "rec", 1)
+    rig, rng, rows = load_rig(tmp_path / "rec"), np.random.default_rng(0), 40
+    columns = {
+        "azimuth_rad": rng.uniform(-np.pi, np.pi, rows),
+        "ring": rng.integers(0, rig.lidar.rings, rows),
+        "temperature_c": rng.uniform(20.0, 24.0, rows),
+        "tracked": np.tile(np.eye(4), (rows, len(rig.tracker.bodies), 1, 1)),
+    }
+    view, seen = View(rig, rows, columns, np.zeros((rows, len(rig.joint_names)))), (20.0, 24.0)
+    if what in ("elevation", "azimuth"):
+        tested = DirectionShape(what, (-np.pi, np.pi))
+        expected = tested.basis(view)
+    elif what == "ring":
+        ring = int(columns["ring"][7])
+        whole = RingSlope("temperature_c", seen)
+        tested, basis = whole.alone(ring), whole.basis(view)
+        expected = np.where(basis.index == ring, basis.values.T, 0.0).T[:, :, None]
+        assert expected.any()
+    else:
+        slip = next(e for e in CATALOGUE if e.name == f"{what}_slip")
+        whole = PoseSlope(slip, "temperature_c", seen, formulas_of(slip, rig))
+        tested, expected = whole.alone(4), whole.basis(view)[..., 4:5]
+    told = proposal(tested)
+    effect = FormulaEffect.read(told, "diagnosis.json", {})
+    np.testing.assert_allclose(effect.basis(view), expected, atol=1e-9)
+    assert {p.unit for p in effect.params(rig)} == {
+        "m" if what in ("ring", "lidar", "body") else "rad"
+    }
+
+
+def test_what_the_tracker_does_has_no_formula(tmp_path):
+    """It turns bodies about its own axes. Nor has a mount that not every rig has."""
+    simulate("tiny", tmp_path / "rec", 1)
+    rig = load_rig(tmp_path / "rec")
+    slip = next(e for e in CATALOGUE if e.name == "tracker_slip")
+    assert formulas_of(slip, rig) == ()
+    assert proposal(PoseSlope(slip, "humidity", (0.0, 1.0), ()).alone(2)) is None
+
+
+def test_each_ring_and_each_way_is_tested_alone():
+    """In every rig that has it, but for what rows hardly feel beside the others."""
+    effects = [RingSlope("humidity", (0.0, 1.0)), JointShape("turn", "lift", (-1.0, 0.5))]
+    of_rigs = {
+        effects[0].name: [np.arange(3), np.arange(3, 5)],
+        effects[1].name: [np.arange(5, 11)],
+    }
+    felt = np.array([1.0, 1e-12, 1.0, 2.0, 1e-12, *6 * [1.0]])
+    alone, at = singly(effects, of_rigs, felt)
+    assert [e.name for e in alone] == ["structure:ring,humidity@0", "structure:ring,humidity@2",
+                                       "structure:turn,lift"]  # fmt: skip
+    assert [at[e.name].tolist() for e in alone] == [[0, 3], [2], [5, 6, 7, 8, 9, 10]]
+    assert {e.family for e in alone[:2]} == {effects[0].name} and of_look(alone[1]) is effects[0]
 
 
 def proposal(effect, taken=()):

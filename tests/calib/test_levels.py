@@ -255,7 +255,8 @@ def test_the_zeros_of_accelerometers_are_found_where_they_are_told_of(recording,
     (folder / "rig.yaml").write_text(yaml.safe_dump(rig))
     wide = calib.fit(folder, tmp_path / "wide").summary
     more = {zero["frame"]: zero["sigma_rad"] for zero in wide["level_zeros"]}
-    assert wide["sigmas_widened_by"] > 1.2 and max(more["base"]) < 0.0065
+    assert wide["sigmas_widened_by"] > 1.2
+    assert max(more["base"]) < 1.05 * found["base"]["sigma_rad"][2]
 
 
 def test_a_zero_turns_what_is_felt_as_it_does(problem):

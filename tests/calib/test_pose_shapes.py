@@ -20,7 +20,7 @@ from ..bench.formulas_worlds import Case, written
 from ..mishaps import Scene
 from ..mishaps.scene import QUAT
 
-# Six numbers of a motion are seen over a column in 30 stops or more.
+# Six numbers of a motion together are seen over a column in 30 stops or more.
 SPEC = Spec(
     lidar="hesai_pandarxt32", locations=5, stops_per_location=6, column_step=400, occluded_share=0
 )

@@ -37,7 +37,7 @@ HIDDEN = {
     ),
     one_ring: (
         {"covariates": ["ring", "temperature_c"], "moves": None, "ring": 13},
-        "depends on temperature, in ring 13 alone",
+        "depends on temperature, most clearly in ring 13",
         "empirical_ring_013_temperature_c",
     ),
 }

@@ -94,9 +94,9 @@ def in_place(
         before, after: the looks without them and with them.
         common: as of `ScoreTest.evidence`.
     """
-    left = {c.effect.name: c.test.statistic for c in after.unnamed.candidates}
+    left = {c.effect.family: c.test.statistic for c in after.unnamed.candidates}
     for candidate in before.unnamed.candidates:
-        most = explained + left.get(candidate.effect.name, np.inf)
+        most = explained + left.get(candidate.effect.family, np.inf)
         statistic = min(candidate.test.statistic, most)
         yield candidate, evidence(statistic, candidate.test.dof, common)
 

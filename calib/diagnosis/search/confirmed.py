@@ -80,9 +80,10 @@ def outlasts(look: Look, candidate: Candidate) -> bool:
 
 def outdoing(look: Look, statistic: float) -> list[Effect]:
     """Effects of the catalogue that explain as much as values by chance do (a log-likelihood ratio,
-    twice), less their parameters, though too few stops, targets or surfaces show them to be named:
-    that which does best, and those near it. They may be what seems to scatter."""
+    twice), less their parameters, and stand out, though too few stops, targets or surfaces show
+    them to be named: that which does best, and those near it. They may be what seems to scatter."""
     found = [c for c in look.named.candidates if 2.0 * c.evidence > statistic]
+    found = [c for c in found if stands_out(c, ALPHA_EFFECT)]
     return [c.effect for c in found if found[0].evidence - c.evidence < ODDS]
 
 

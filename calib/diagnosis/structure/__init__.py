@@ -7,16 +7,18 @@ from itertools import chain, combinations, permutations
 
 import numpy as np
 
+from calib.diagnosis.score import UNFELT
 from calib.diagnosis.structure.empirical import (
     Binned,
     DirectionShape,
     EachAlone,
     JointShape,
+    OfPose,
     PoseShape,
     PoseSlope,
     RingSlope,
 )
-from calib.effects import CATALOGUE, Effect, Site
+from calib.effects import CATALOGUE, Effect, Param, Site
 from calib.effects.rig import MountSlip
 from calib.problem.model import Source
 from calib.rig import Rig
@@ -27,7 +29,9 @@ COVARIATE_BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests have no power.
 STOPS_A_BIN = 5
-STOPS_A_LINE = 8  # of a pose over a column: two say nothing, and stops scatter
+STOPS_A_LINE = (
+    8  # a choice, of a line with two unknowns: six stops are left to say how they scatter
+)
 POSE_WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
 # What a range error may depend on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
@@ -40,10 +44,17 @@ WITH_OWN = ("range_m", "elevation_rad")
 
 
 def singly(
-    effects: Sequence[Effect], of_rigs: Mapping[str, Sequence[np.ndarray]]
+    effects: Sequence[Effect], of_rigs: Mapping[str, Sequence[np.ndarray]], felt: np.ndarray
 ) -> tuple[list[Effect], dict[str, np.ndarray]]:
     """Structure as it is tested, and the columns of each, of its parameters in every rig that has
-    it."""
+    it.
+
+    Args:
+        effects: as a look has them.
+        of_rigs: of each, its columns in every rig.
+        felt: (Q,) size of what rows tell of a column: of those that they hardly feel, beside
+            others of the effect, nothing is tested.
+    """
     out, at = [], {name: np.concatenate(each) for name, each in of_rigs.items()}
     for effect in effects:
         if not isinstance(effect, EachAlone):
@@ -51,23 +62,25 @@ def singly(
             continue
         rigs = of_rigs.get(effect.name, ())
         for number in range(max(map(len, rigs), default=0)):
-            out.append(one := effect.alone(number))
-            at[one.name] = np.array([columns[number] for columns in rigs if number < len(columns)])
+            mine = np.array([columns[number] for columns in rigs if number < len(columns)])
+            if felt[mine].max() > UNFELT * felt[at[effect.name]].max():
+                out.append(one := effect.alone(number))
+                at[one.name] = mine
     return out, at
 
 
 def of_look(effect: Effect) -> Effect:
     """The effect whose unknowns a look has, for one that was tested."""
-    return (effect.whole or effect) if isinstance(effect, EachAlone) else effect
+    return (effect.one_of or effect) if isinstance(effect, EachAlone) else effect
 
 
 def what_moves(effect: Effect) -> str | None:
     """What structure moves, where it is no error of a range or a joint."""
-    return effect.what if isinstance(effect, PoseShape | PoseSlope | DirectionShape) else None
+    return effect.what if isinstance(effect, OfPose | DirectionShape) else None
 
 
 def ring_of(effect: Effect) -> int | None:
-    """The ring that structure is of, where it is of one alone."""
+    """The ring that shows structure most, where each is tested alone."""
     return effect.only if isinstance(effect, RingSlope) else None
 
 
@@ -97,9 +110,9 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
             out.append(Binned(edges, centres, {c: _ends(sample[c]) for c in names}))
     ends = {c: _ends(sample[c]) for c in ("range_m", *own) if c in sample}
     out += [RingSlope(c, (low, high)) for c, (low, high) in ends.items() if high > low]
-    if "azimuth_rad" in sample:
-        around = _ends(sample["azimuth_rad"])
-        out += [DirectionShape(what, around) for what in ("elevation", "azimuth")]
+    low, high = _ends(sample.get("azimuth_rad", np.zeros(0)))
+    if high > low:
+        out += [DirectionShape(what, (low, high)) for what in ("elevation", "azimuth")]
     joints: dict[str, list[np.ndarray]] = {}
     for name, values in (each for s in sources for each in _moving(s)):
         joints.setdefault(name, []).append(values)
@@ -109,13 +122,14 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
     return [*out, *_moved(sources)]
 
 
-def _sites(slip: MountSlip, rig: Rig) -> tuple[str, ...]:
-    """Where formulas act that move what a slip moves, for each of its parameters."""
-    names = [move.name for move in slip.params(rig)]
-    if slip.site is Site.EDGE:
-        return tuple(f"{rig.tree.edge_names[slip.edge(rig)]}.{name}" for name in names)
-    # What moves all bodies, the tracker, moves none in its own axes.
-    return tuple(f"tracker:{name}" for name in names) if "." in names[0] else ()
+def formulas_of(slip: MountSlip, rig: Rig) -> tuple[tuple[str, Param], ...]:
+    """Where formulas act that move what a slip moves, and for each its parameter."""
+    moves = slip.params(rig)
+    if slip.site is Site.EDGE and moves:
+        edge = rig.tree.edge_names[slip.edge(rig)]
+        return tuple((f"{edge}.{move.name}", move) for move in moves)
+    # The tracker turns bodies about its own axes, and a formula acts in those of each body.
+    return tuple((f"tracker:{move.name}", move) for move in moves if "." in move.name)
 
 
 def _moved(sources: Sequence[Source]) -> Iterator[PoseShape | PoseSlope]:
@@ -128,15 +142,15 @@ def _moved(sources: Sequence[Source]) -> Iterator[PoseShape | PoseSlope]:
     )
     for column in sorted(columns):
         values = np.concatenate([s.columns[column] for s in sources])
-        low, high = _ends(values[np.isfinite(values)])
+        low, high = _ends(values)
         for slip in slips if high > low else ():
             each = max(len(slip.params(s.rig)) for s in sources)
             if waves := min(POSE_WAVES, stops // (STOPS_A_BIN * each)):
                 yield PoseShape(slip, column, (low, high), waves)
             elif stops >= STOPS_A_LINE:
-                sites = {_sites(slip, s.rig) for s in sources if slip.params(s.rig)}
-                one = sites.pop() if len(sites) == 1 else ()
-                yield PoseSlope(slip, column, (low, high), one)
+                formulas = {formulas_of(slip, s.rig) for s in sources}
+                every = formulas.pop() if len(formulas) == 1 else ()  # it acts in every rig
+                yield PoseSlope(slip, column, (low, high), every)
 
 
 def _moving(source: Source) -> Iterator[tuple[str, np.ndarray]]:
@@ -149,7 +163,9 @@ def _moving(source: Source) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:
-    return float(np.nanmin(values)), float(np.nanmax(values))
+    """The least and the largest value; NaN where none is finite."""
+    values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if len(values) else (np.nan, np.nan)
 
 
 def _bins(covariate: str, together: int, stops: int) -> int:

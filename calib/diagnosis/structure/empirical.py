@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 
 from calib.effects import Effect, OneHot, Param, Site, View
-from calib.effects.basis import AZIMUTH, ELEVATION, RANGE, beam
+from calib.effects.basis import AZIMUTH, ELEVATION, RANGE, beam, finite
 from calib.effects.rig import MountSlip
 from calib.rig import Rig
 
-DIRECTION_WAVES = 6  # a turn, of the directions of beams: what 12 bins of azimuth show
+DIRECTION_WAVES = 6  # orders, a turn: a choice, as catalogued ones are the first and the second
 
 
 class Binned(Effect):
@@ -69,16 +69,16 @@ class EachAlone(Effect):
 
     Attributes:
         only: number of the parameter that is tested; None of the whole.
-        whole: all of it.
+        one_of: all of it; None of the whole.
     """
 
     only: int | None = None
-    whole: Self | None = None
+    one_of: Self | None = None
 
     def alone(self, number: int) -> Self:
         """One of its parameters."""
         one = copy.copy(self)
-        one.name, one.only, one.whole = f"{self.name}@{number}", number, self
+        one.name, one.only, one.one_of = f"{self.name}@{number}", number, self
         return one
 
 
@@ -180,76 +180,19 @@ class JointShape(Effect):
         return out
 
 
-class PoseShape(Effect):
-    """Something is moved by a smooth function of a column of the stops; empirical.
+class OfPose(Effect):
+    """Something is moved by a function of a column of the stops; empirical.
 
     Args:
         slips: the effect that moves it once: the mount, a tracked body, or the tracker.
         column: of the stops.
         seen: its least and largest value.
-        waves: how many cosines there are of each motion.
     """
 
     typical = "empirical"
-    formula = "moved by exp(sum over m = 1..M of a_m cos(pi m u)), u = 0 to 1 over the column"
 
-    def __init__(
-        self, slips: MountSlip, column: str, seen: tuple[float, float], waves: int
-    ) -> None:
+    def __init__(self, slips: MountSlip, column: str, seen: tuple[float, float]) -> None:
         self.slips, self.site = slips, slips.site
-        self.column, self.seen, self.waves = column, {column: seen}, waves
-        self.covariates = (column,)
-        self.name = f"structure:{self.what},{column}"
-
-    @property
-    def of_lidar(self) -> bool:
-        return self.slips.of_lidar
-
-    @property
-    def goes_by_place(self) -> bool:
-        return self.slips.goes_by_place
-
-    @property
-    def what(self) -> str:
-        """What is moved: mount, body, base or tracker."""
-        return self.slips.family.removesuffix("_slip")
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        each = self.slips.params(rig)
-        return tuple(
-            replace(move, name=f"{move.name}.{m}") for m in range(self.waves) for move in each
-        )
-
-    def basis(self, view: View) -> np.ndarray:
-        low, high = self.seen[self.column]
-        u = (view[self.column] - low) / (high - low)
-        known = np.isfinite(u)
-        waves = (np.where(known, np.cos(np.pi * m * u), 0.0) for m in range(1, self.waves + 1))
-        return np.concatenate([self.slips.moved(view, wave) for wave in waves], axis=-1)
-
-
-class PoseSlope(EachAlone):
-    """Something is moved in proportion to a column of the stops, one way alone; empirical. Of stops
-    that are too few for a `PoseShape`.
-
-    Args:
-        slips: as of that.
-        column: of the stops.
-        seen: its least and largest value.
-        sites: where a formula for each parameter acts; empty where none can.
-    """
-
-    typical = "empirical"
-    formula = "moved by exp(a * (column - its middle) / half its span)"
-
-    def __init__(
-        self,
-        slips: MountSlip,
-        column: str,
-        seen: tuple[float, float],
-        sites: Sequence[str],
-    ) -> None:
-        self.slips, self.site, self.sites = slips, slips.site, sites
         self.column, self.seen = column, {column: seen}
         self.covariates = (column,)
         self.name = f"structure:{self.what},{column}"
@@ -267,9 +210,61 @@ class PoseSlope(EachAlone):
         """What is moved: mount, body, base or tracker."""
         return self.slips.family.removesuffix("_slip")
 
+
+class PoseShape(OfPose):
+    """It is moved by a smooth function.
+
+    Args:
+        slips, column, seen: as of `OfPose`.
+        waves: how many cosines there are of each motion.
+    """
+
+    formula = "moved by exp(sum over m = 1..M of a_m cos(pi m u)), u = 0 to 1 over the column"
+
+    def __init__(
+        self, slips: MountSlip, column: str, seen: tuple[float, float], waves: int
+    ) -> None:
+        super().__init__(slips, column, seen)
+        self.waves = waves
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        each = self.slips.params(rig)
+        return tuple(
+            replace(move, name=f"{move.name}.{m}") for m in range(self.waves) for move in each
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        low, high = self.seen[self.column]
+        u = (view[self.column] - low) / (high - low)
+        known = np.isfinite(u)
+        waves = (np.where(known, np.cos(np.pi * m * u), 0.0) for m in range(1, self.waves + 1))
+        return np.concatenate([self.slips.moved(view, wave) for wave in waves], axis=-1)
+
+
+class PoseSlope(OfPose, EachAlone):
+    """It is moved in proportion to the column, one way alone. Of stops that are too few for a
+    `PoseShape`.
+
+    Args:
+        slips, column, seen: as of `OfPose`.
+        formulas: where a formula for each parameter acts, and the parameter; empty where none can.
+    """
+
+    formula = "moved by exp(a * (column - its middle) / half its span)"
+
+    def __init__(
+        self,
+        slips: MountSlip,
+        column: str,
+        seen: tuple[float, float],
+        formulas: Sequence[tuple[str, Param]],
+    ) -> None:
+        super().__init__(slips, column, seen)
+        self.formulas = formulas
+
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return self.slips.params(rig)
 
     def basis(self, view: View) -> np.ndarray:
         middle, half = middle_and_half(*self.seen[self.column])
-        return self.slips.moved(view, np.nan_to_num((view[self.column] - middle) / half))
+        return self.slips.moved(view, finite((view[self.column] - middle) / half))

@@ -23,7 +23,7 @@ from calib.diagnosis.score import projection
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import hangs_on, words
+from calib.diagnosis.suggest import in_words
 from calib.effects import Site
 from calib.results.errors import Errors
 from calib.results.holdout import TAKEN_BACK, Fall
@@ -225,7 +225,7 @@ def weighed(
             if told.enough:
                 kept[key].append(candidate)
             elif key == "unnamed":
-                what = " and ".join(words(c) for c in hangs_on(candidate.effect))
+                what = in_words(candidate.effect)
                 traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
     if not refused and not named:
         kept["at_first"] = []  # nothing stands in the way of what is left

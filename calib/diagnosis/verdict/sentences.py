@@ -11,7 +11,7 @@ from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
-from calib.diagnosis.suggest import all_of, hangs_on, words
+from calib.diagnosis.suggest import all_of, in_words, words
 from calib.diagnosis.verdict.matters import Weighed
 from calib.results.holdout import TAKEN_BACK, from_to
 
@@ -102,7 +102,7 @@ def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
 def unconfirmed(candidate: Candidate, over: float) -> str:
     """Of structure that too few stops see for any test to confirm it, where the held-out error is
     so many times the expected one."""
-    what = " and ".join(words(c) for c in hangs_on(candidate.effect))
+    what = in_words(candidate.effect)
     return (
         f"The held-out error is {over:.1f} times as large as expected, and no test confirms why. "
         f"Taken one by one, the beams show residuals that depend on {what}, but too few stops or "
@@ -141,7 +141,7 @@ def _structure_sentences(unexplained: Sequence[Mapping[str, Any]], residual: str
     for each in unexplained[:2]:
         ring, on = each.get("ring"), each["covariates"]
         what = " and ".join(words(c) for c in on if c != "ring" or ring is None)
-        what += "" if ring is None else f", in ring {ring} alone"
+        what += "" if ring is None else f", most clearly in ring {ring}"
         moves = f", as if {WHAT_MOVES[each['moves']]}" if each.get("moves") else ""
         out.append(
             f"The residual structure depends on {what}{moves}: {each['rms_mm']:.2f} mm rms of "
