@@ -107,17 +107,15 @@ def screen(
     least, found, many = [], [], 0
     for family in families.values():
         drawn, looks = np.min([by_chance[e.name] for e in family], axis=0), float(len(family))
-        p_value = [tests[e.name].p_value() for e in family]
         best = max(family, key=lambda e: tests[e.name].evidence(common))
-        if isinstance(family[0], EachAlone):  # that is judged which chance explains least
-            best = family[int(np.argmin(p_value))]
-        else:
-            looks = looked(drawn)
+        p = tests[best.name].p_value()
+        if not isinstance(best, EachAlone):  # shapes of one effect, which have much in common
+            looks, p = looked(drawn), min(tests[e.name].p_value() for e in family)
         if looks < QUANTILE * len(drawn):
             least.append(after_looks(drawn, looks))
         else:  # so few draws cannot tell how small its smallest p-value is
             many += 1
-        found.append((best, after_looks(min(p_value), looks), looks))
+        found.append((best, after_looks(p, looks), looks))
     together = many + (looked(np.min(least, axis=0)) if least else 0.0) or 1.0
     candidates = [
         Candidate(
