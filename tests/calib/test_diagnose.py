@@ -303,7 +303,7 @@ def test_a_name_is_held_against_structure_at_the_price_of_both(looks, hold):
     def explains(evidence, looks):
         # Of two degrees of freedom the tail is exp(-x / 2).
         test = SimpleNamespace(statistic=2 * evidence, dof=2, columns=[0, 1])
-        effect = SimpleNamespace(name="bins", params=lambda rig: [])
+        effect = SimpleNamespace(name="bins", family="bins", params=lambda rig: [])
         return SimpleNamespace(test=test, looks=looks, effect=effect)
 
     named = explains(50.0, 30.0)

@@ -110,7 +110,7 @@ def test_a_formula_does_what_it_stands_for(tmp_path, what):
     }
     view, seen = View(rig, rows, columns, np.zeros((rows, len(rig.joint_names)))), (20.0, 24.0)
     if what in ("elevation", "azimuth"):
-        tested = DirectionShape(what, (-np.pi, np.pi))
+        tested = DirectionShape(what, (-np.pi, np.pi), 4)
         expected = tested.basis(view)
     elif what == "ring":
         ring = int(columns["ring"][7])

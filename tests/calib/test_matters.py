@@ -12,6 +12,7 @@ from calib import add, diagnose, fit
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.search.named import Rival
 from calib.diagnosis.stand import Stand
+from calib.diagnosis.structure.empirical import Binned
 from calib.diagnosis.verdict import _over_the_expected, _unconfirmed, conclude
 from calib.diagnosis.verdict.matters import (
     FALL_MATTERS,
@@ -198,7 +199,8 @@ def test_a_name_that_held_out_stops_refuse_says_something_only_where_structure_d
         p_adjusted=1e-3,
         rivals=[],
     )
-    strongest = max(look.unnamed.candidates, key=lambda c: c.evidence)
+    bins = (c for c in look.unnamed.candidates if isinstance(c.effect, Binned))
+    strongest = max(bins, key=lambda c: c.evidence)
     found = Search(
         looks=[look],
         found=[step],

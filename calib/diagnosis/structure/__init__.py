@@ -29,9 +29,11 @@ COVARIATE_BINS, PAIR_BINS = 12, 6
 AZIMUTH_BINS = 24
 # Of columns of the stops: with more parameters than a fifth of these, tests have no power.
 STOPS_A_BIN = 5
-STOPS_A_LINE = (
-    8  # a choice, of a line with two unknowns: six stops are left to say how they scatter
-)
+STOPS_A_LINE = 8  # a choice: a line takes two, and six are left to say how stops scatter
+DIRECTION_WAVES = 6  # orders, a turn: a choice, as catalogued ones are the first and the second
+# Azimuths that a wave is told from, of so many different ones: a choice; of fewer, as where scans
+# were thinned to five columns, waves make up a value of its own for each column.
+AZIMUTHS_A_WAVE, ONE_AZIMUTH_RAD = 6, 0.01
 POSE_WAVES = 4  # of a pose over a column: its quarters, as 12 bins have thirds of those
 # What a range error may depend on alone, and the pairs that matter; others pair with range.
 POINT = ("range_m", "incidence_rad", "azimuth_rad", "elevation_rad", "intensity")
@@ -110,9 +112,10 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
             out.append(Binned(edges, centres, {c: _ends(sample[c]) for c in names}))
     ends = {c: _ends(sample[c]) for c in ("range_m", *own) if c in sample}
     out += [RingSlope(c, (low, high)) for c, (low, high) in ends.items() if high > low]
-    low, high = _ends(sample.get("azimuth_rad", np.zeros(0)))
-    if high > low:
-        out += [DirectionShape(what, (low, high)) for what in ("elevation", "azimuth")]
+    azimuth = sample.get("azimuth_rad", np.zeros(0))
+    apart = len(np.unique(np.rint(azimuth / ONE_AZIMUTH_RAD)))
+    if orders := min(DIRECTION_WAVES, apart // AZIMUTHS_A_WAVE):
+        out += [DirectionShape(x, _ends(azimuth), orders) for x in ("elevation", "azimuth")]
     joints: dict[str, list[np.ndarray]] = {}
     for name, values in (each for s in sources for each in _moving(s)):
         joints.setdefault(name, []).append(values)

@@ -15,8 +15,6 @@ from calib.effects.basis import AZIMUTH, ELEVATION, RANGE, beam, finite
 from calib.effects.rig import MountSlip
 from calib.rig import Rig
 
-DIRECTION_WAVES = 6  # orders, a turn: a choice, as catalogued ones are the first and the second
-
 
 class Binned(Effect):
     """Range has an error of its own in every bin of some covariates; empirical.
@@ -122,6 +120,7 @@ class DirectionShape(Effect):
     Args:
         what: "elevation" or "azimuth", which errs.
         seen: the least and largest azimuth.
+        orders: how often a turn the last of its waves comes.
     """
 
     site = Site.BEAM
@@ -129,8 +128,8 @@ class DirectionShape(Effect):
     covariates = ("azimuth_rad",)
     formula = "angle = true + sum over m of a_m sin(m azimuth) + b_m cos(m azimuth)"
 
-    def __init__(self, what: str, seen: tuple[float, float]) -> None:
-        self.what, self.seen = what, {"azimuth_rad": seen}
+    def __init__(self, what: str, seen: tuple[float, float], orders: int) -> None:
+        self.what, self.seen, self.orders = what, {"azimuth_rad": seen}, orders
         self.name = f"structure:{what} of beams,azimuth_rad"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
@@ -139,11 +138,11 @@ class DirectionShape(Effect):
 
     def waves(self) -> list[str]:
         """The functions, as a formula has them."""
-        orders = range(1, DIRECTION_WAVES + 1)
+        orders = range(1, self.orders + 1)
         return [f"{f}({m} * azimuth_rad)" for m in orders for f in ("sin", "cos")]
 
     def basis(self, view: View) -> np.ndarray:
-        turns = [m * view["azimuth_rad"] for m in range(1, DIRECTION_WAVES + 1)]
+        turns = [m * view["azimuth_rad"] for m in range(1, self.orders + 1)]
         waves = [f(turn) for turn in turns for f in (np.sin, np.cos)]
         return beam(ELEVATION if self.what == "elevation" else AZIMUTH, *waves)
 
