@@ -116,7 +116,7 @@ def screen(
         else:  # so few draws cannot tell how small its smallest p-value is
             many += 1
         found.append((best, after_looks(p, looks), looks))
-    together = many + (looked(np.min(least, axis=0)) if least else 0.0) or 1.0
+    together = max(many + (looked(np.min(least, axis=0)) if least else 0.0), 1.0)
     candidates = [
         Candidate(
             effect=effect,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.diagnosis.screen import Candidate
+from calib.diagnosis.structure import ring_of
 from calib.diagnosis.structure.empirical import (
     Binned,
     DirectionShape,
@@ -141,10 +142,14 @@ def outward(low: float, high: float) -> list[float]:
     return [round(float(end), digits) for end in ends]
 
 
+def with_ring(covariates: Sequence[str], ring: int | None) -> list[str]:
+    """The covariates of structure, with the number of the ring where one was tested by itself."""
+    return [f"ring {ring}" if c == "ring" and ring is not None else c for c in covariates]
+
+
 def in_words(effect: Effect) -> str:
-    """The covariates of structure in a sentence, and the ring where one was tested by itself."""
-    told = " and ".join(words(c) for c in hangs_on(effect))
-    return told.replace("ring", f"ring {effect.only}") if isinstance(effect, RingSlope) else told
+    """The covariates of structure in a sentence."""
+    return " and ".join(words(c) for c in with_ring(hangs_on(effect), ring_of(effect)))
 
 
 def hangs_on(effect: Effect) -> tuple[str, ...]:

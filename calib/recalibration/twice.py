@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.problem.model import Source
-from calib.rig.inventory import copied
+from calib.rig.inventory import copied, poses_of
 from calib.rig.suspect import listed
 from chains.errors import InputError
 
@@ -75,7 +75,7 @@ def _measured(source: Source, scans: Mapping[str, str]) -> dict[str, str]:
     """Stop -> a digest of what was measured there: of the file of its scan or, where it has none
     and a body was seen, of its row of joints and poses."""
     stops, out = source.recording, {}
-    poses = np.hstack(list(stops.bodies.values()) or [np.full((len(stops.stops), 1), np.nan)])
+    poses = poses_of(stops)
     rows, seen = np.hstack([stops.joints, poses]), np.isfinite(poses).any(axis=1)
     for k, name in enumerate(stops.stops):
         if stops.has_scan[k]:

@@ -217,7 +217,7 @@ class _Checker:
         if turned := lidars_turned(problem, values):
             values = {**values, **turned}
             self._tell([_turned(problem.scans[0], problem.initial, values)])
-        self._tell(map(_other_axes, axes_of(problem, values)))
+        self._tell(map(_other_axes, axes_of(problem, values, turned)))
         kept, placed = [], []
         for i, scan in enumerate(problem.scans):
             self.progress("placing scans", i, len(problem.scans))

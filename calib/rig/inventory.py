@@ -183,10 +183,15 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
         )
 
 
+def poses_of(recording: RecordedStops) -> np.ndarray:
+    """Poses (K, 7 B) of all bodies, side by side."""
+    return np.hstack(list(recording.bodies.values()) or [np.zeros((len(recording.stops), 0))])
+
+
 def copied(recording: RecordedStops, unseen: bool = False) -> dict[str, str]:
     """Stop -> an earlier one with the same joints and the same poses, to every digit; of stops
     where a body was seen or, if that is asked, of all."""
-    poses = np.hstack(list(recording.bodies.values()) or [np.zeros((len(recording.stops), 0))])
+    poses = poses_of(recording)
     first: dict[bytes, str] = {}
     found = {}
     for stop, joints, pose in zip(recording.stops, recording.joints, poses, strict=True):
@@ -202,7 +207,7 @@ def odd_copies(recording: RecordedStops) -> Iterator[str]:
         pairs = [f"{stop} of {of}" for stop, of in copies.items()]
         yield (
             f"stops.csv holds joints and poses of one stop again at another, to every digit "
-            f"({listed(pairs)}): a copy counts as a second measurement; if it is none, leave it out"
+            f"({listed(pairs)}); a copy would count as a second measurement, so remove its row"
         )
 
 

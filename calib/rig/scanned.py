@@ -177,8 +177,8 @@ def _coarse(scans: ScanSums, lidar: LidarModel) -> Iterator[str]:
     if coarse := [name for name, step_m in scans.rounded_m.items() if step_m > known_m]:
         step_m = scans.rounded_m[coarse[0]]
         yield (
-            f"ranges are multiples of {1e3 * step_m:.3g} mm at {listed(coarse)}, more than the "
-            f"LiDAR's noise; if they are, write 'quantum_m: {step_m:g}' under 'lidar' in rig.yaml"
+            f"ranges are multiples of {1e3 * step_m:.3g} mm at {listed(coarse)}, a step larger "
+            f"than the LiDAR's noise; give it as 'quantum_m: {step_m:g}' under 'lidar' in rig.yaml"
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from calib.diagnosis.suggest import with_ring
 from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.runs.ladder import Rung, ladder
 from calib.show.comparison import ladder_table
@@ -153,11 +154,6 @@ def _fall(candidate: Mapping[str, Any]) -> Iterator[str]:
             yield fall if unit == "mm" else f"{fall} {unit}"
 
 
-def _ring(each: Mapping[str, Any]) -> str:
-    """Of residual structure that one ring shows most, which."""
-    return "ring" if each.get("ring") is None else f"ring {each['ring']}"
-
-
 def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -> Table:
     """Structure that no effect accounts for, strongest first."""
     table = columns_table("residual structure over", "p", "mm", "to add it")
@@ -168,7 +164,7 @@ def unexplained_table(unexplained: Sequence[Mapping[str, Any]], residual: str) -
     for each in unexplained:
         formula = each["formula"]["name"] if each["formula"] else ""
         table.add_row(
-            " x ".join(each["covariates"]).replace("ring", _ring(each)),
+            " x ".join(with_ring(each["covariates"], each.get("ring"))),
             small(each["p_adjusted"]),
             _size(each["rms_mm"]),
             formula,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -119,16 +119,24 @@ class OtherAxes(NamedTuple):
     read: np.ndarray | None
 
 
-def axes_of(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[OtherAxes]:
+def axes_of(
+    problem: Problem, values: Mapping[str, np.ndarray], turned: Collection[str] | None = None
+) -> Iterator[OtherAxes]:
     """Axes that were exchanged or mirrored, if the beams of a LiDAR are less than half as far off
     when they are set right: of the mesh or of the tracker by quarter turns and mirrors; of scans
-    mirrored, in any orientation. Nothing where the LiDAR turned, as it is, does as well."""
+    mirrored, in any orientation. Nothing where the LiDAR turned, as it is, does as well.
+
+    Args:
+        problem, values: as of `lidars_turned`.
+        turned: the frames that this turns, where they are known.
+    """
+    turned = lidars_turned(problem, values) if turned is None else turned
     quarters = Rotation.create_group("O").as_matrix().round()
     every = np.concatenate([quarters, quarters @ MIRROR])
-    for scans in _sampled(problem, values).values():
+    for (name, _), scans in _sampled(problem, values).items():
         chosen, frame = _asked(scans), scans[0].scan.stops.rig.lidar_frame
         start_m = _off_m(chosen, np.eye(3)[None])[0]
-        if start_m < NEAR_M or _best_turn(scans) is not None:
+        if start_m < NEAR_M or name in turned:
             continue
         for whose in ("mesh", "tracker"):
             at = (each.read(whose, every, values) for each in chosen)

@@ -16,7 +16,7 @@ from calib.diagnosis.structure.empirical import (
     PoseSlope,
     RingSlope,
 )
-from calib.diagnosis.suggest import formula
+from calib.diagnosis.suggest import formula, with_ring
 from calib.effects import CATALOGUE, View
 from calib.effects.own.formula import FormulaEffect
 from calib.rig import load_rig
@@ -152,6 +152,11 @@ def test_each_ring_and_each_way_is_tested_alone():
                                        "structure:turn,lift"]  # fmt: skip
     assert [at[e.name].tolist() for e in alone] == [[0, 3], [2], [5, 6, 7, 8, 9, 10]]
     assert {e.family for e in alone[:2]} == {effects[0].name} and of_look(alone[1]) is effects[0]
+
+
+def test_a_ring_s_number_stands_beside_no_other_column():
+    assert with_ring(["ring", "spring_n"], 3) == ["ring 3", "spring_n"]
+    assert with_ring(["ring", "spring_n"], None) == ["ring", "spring_n"]
 
 
 def proposal(effect, taken=()):

@@ -105,7 +105,7 @@ class RingSlope(EachAlone):
         middle, half = middle_and_half(*self.seen[self.column])
         u = np.broadcast_to((view[self.column] - middle) / half, view.rows)
         along = np.zeros((view.rows, 3))
-        along[:, RANGE] = np.nan_to_num(u)
+        along[:, RANGE] = finite(u)
         return OneHot(np.where(np.isfinite(u), view["ring"], -1), along, view.rig.lidar.rings)
 
 
