@@ -75,7 +75,7 @@ class Assembly:
 
     Args:
         layout: which column is what.
-        own: rows about stops' own unknowns.
+        own: rows about stops' own unknowns, those of priors last.
         raw: whether the Gram matrix before eliminations is wanted.
     """
 
@@ -146,12 +146,12 @@ class Assembly:
         """Eliminate all but the kept."""
         self._finish_scanned()
         count, stops = len(self.cells), list(self.waiting)
-        for first in range(0, len(stops), STOPS_TOGETHER):
-            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
         if self.raw is not None:
             self.raw += self.half[count:-1, count:-1]
             self.raw += self.raw.T.copy()
             self.half += self.taken
+        for first in range(0, len(stops), STOPS_TOGETHER):
+            self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
         rest = self.half[count:, count:] + self.half[count:, count:].T
         if count:
             prior = self._cell_priors(values)
@@ -198,7 +198,7 @@ class Assembly:
         kept = positions(self.layout.size, self.layout.kept)
         for some in self._alike(list(beams)):
             mine, at = self._columns(some[0])
-            count, rows = len(self._own(some[0])), self._stacked(some, at, len(mine))
+            count, (rows, _) = len(self._own(some[0])), self._stacked(some, at, len(mine))
             others = self.at[mine[count:]]
             A = np.stack([beams[stop].information for stop in some])
             T_own = np.zeros((len(some), TWIST, count))
@@ -277,25 +277,35 @@ class Assembly:
     def _finish_without_beams(self, stops: Sequence[int]) -> None:
         """Eliminate what is their own from stops that have no beams. Their rows are few: they are
         turned until no more of them touch a stop's own unknowns than there are of these (QR), which
-        go with these, and all others go into one product."""
-        kept = positions(self.layout.size, self.layout.kept)
+        go with these, and all others go into one product. Priors of their own unknowns have no
+        more than a right side of what is shared."""
         for some in self._alike(stops):
             mine, at = self._columns(some[0])
-            rows, count = self._stacked(some, at, len(mine)), len(self._own(some[0]))
-            if count:
+            rows, told = self._stacked(some, at, len(mine))
+            over, shared = mine[len(self._own(some[0])) :], rows[:, :, len(self._own(some[0])) :]
+            if self.raw is not None:
+                self._add_raw(shared[:, :told, :-1], over[:-1])
+            if count := len(mine) - len(over):
                 Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
-                rows = Q.mT @ rows
-                R, over = R[:, :count], mine[count:]
-                gains = np.linalg.inv(R) @ rows[:, :count, count:]
+                inverse = np.linalg.inv(R[:, :count])
+                gains = _turned(inverse @ Q[:, :, :count].mT, shared, told)
                 self.eliminated += [
                     Eliminated(self._own(stop), over, root.T, gain)
-                    for stop, root, gain in zip(some, R, gains, strict=True)
+                    for stop, root, gain in zip(some, R[:, :count], gains, strict=True)
                 ]
-                if self.raw is not None:
-                    _add_square(self.raw, _over(rows[:, :count, count:-1], kept, over[:-1]))
-            _add_square(self.half, _over(rows[:, count:, count:], self.at, mine[count:]))
+                shared = _turned(Q[:, :, count:].mT, shared, told)
+            _add_square(self.half, _over(shared, self.at, over))
             for stop in some:
                 del self.waiting[stop]
+
+    def _add_raw(self, rows: np.ndarray, columns: np.ndarray) -> None:
+        """Add the products of rows (K, m, n) over kept columns (n,), of each unknown by itself."""
+        place = positions(self.layout.size, self.layout.kept)[columns]
+        first = [at.start for at in self.layout.at.values()]
+        of = np.searchsorted(first, columns, side="right")
+        for some in np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1):
+            mine = rows[:, :, some[0] : some[-1] + 1].reshape(-1, len(some))
+            self.raw[np.ix_(place[some], place[some])] += mine.T @ mine
 
     # ------------------------------------------------------------------------- stops' own rows
 
@@ -319,9 +329,11 @@ class Assembly:
             found.setdefault(like, []).append(stop)
         return list(found.values())
 
-    def _stacked(self, stops: Sequence[int], at: np.ndarray, width: int) -> np.ndarray:
-        """Own rows (K, m, width) of stops that are alike, in units of sigmas; `at` says where the
-        columns of the first of them stand."""
+    def _stacked(
+        self, stops: Sequence[int], at: np.ndarray, width: int
+    ) -> tuple[np.ndarray, int]:
+        """Own rows (K, m, width) of stops that are alike, in units of sigmas, and how many come
+        before those of priors; `at` says where the columns of the first of them stand."""
         each = list(zip(*(self.waiting.get(stop, ()) for stop in stops), strict=True))
         parts = [(self.rows[some[0].of], np.array([one.at for one in some])) for some in each]
         out = np.zeros((len(stops), sum(rows.of_each for rows, _ in parts), width))
@@ -333,7 +345,7 @@ class Assembly:
             here[:, :, at[shared]] = rows.shared[k] * sigma[shared]
             here[:, :, at[own[0]]] = rows.own[k] * sigma[own][:, None]
             here[:, :, -1] = rows.b.reshape(-1, rows.of_each)[k]
-        return out
+        return out, sum(rows.of_each for rows, _ in parts if rows.measured)
 
 
 class _Waiting(NamedTuple):
@@ -367,6 +379,14 @@ def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> Non
     # Each pair of columns once, and each column by itself twice as much as is held of it.
     dsyrk(times, rows.T, beta=1.0, c=target.T, overwrite_c=1)
     np.einsum("ii->i", target)[:] -= times * np.einsum("ij,ij->j", rows, rows) / 2
+
+
+def _turned(turn: np.ndarray, rows: np.ndarray, told: int) -> np.ndarray:
+    """Rows (K, m, n) multiplied by (K, r, m), of which those that come after so many have zeros but
+    for the right side, which is last."""
+    out = turn[:, :, :told] @ rows[:, :told]
+    out[:, :, -1:] += turn[:, :, told:] @ rows[:, told:, -1:]
+    return out
 
 
 def _over(rows: np.ndarray, at: np.ndarray, columns: np.ndarray) -> np.ndarray:

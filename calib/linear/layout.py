@@ -1,7 +1,7 @@
 """The columns of a linearisation: where each unknown stands, and which are eliminated.
 
 Unknowns are of three kinds. *Own* unknowns of a stop (where the rig stands, what its encoders
-misreport) are touched by that stop alone. *Cells* say how far parts of the mesh stand off the room;
+misreport) are touched by that stop alone, or by nothing but their prior. *Cells* say how far parts of the mesh stand off the room;
 no row touches two of the finest cells, so their block of the normal equations is diagonal. All
 others are *kept*: they go to the factor graph.
 """
@@ -87,13 +87,13 @@ class Layout:
             seen = {stops.setdefault(key, len(stops)) for key in keys_of(block)}
             for name in block.variables:
                 touched.setdefault(name, set()).update(seen or {-1})
-        owner = {
-            name: next(iter(seen))
-            for name, seen in touched.items()
-            if unknowns[name].role in (Role.PLACE, Role.JOINTS)
-            and len(seen) == 1
-            and name not in kept
-        }
+        owner: dict[str, int] = {}
+        for name, unknown in unknowns.items():
+            if unknown.role not in (Role.PLACE, Role.JOINTS) or name in kept:
+                continue
+            seen = touched.get(name) or {stops.setdefault((name, 0), len(stops))}
+            if len(seen) == 1:
+                (owner[name],) = seen
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
             own.setdefault(owner[name], []).append(np.r_[at[name]])
@@ -145,7 +145,7 @@ class Layout:
         """Unknowns that are eliminated before the graph is solved."""
         gone = np.ones(self.size, bool)
         gone[self.kept] = False
-        return (name for name, at in self.at.items() if gone[at].any())
+        return (name for name, at in self.at.items() if gone[at.start])
 
     def moves(self, A: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Whether rows (..., m, n) of measurements depend on unknowns that stand in columns

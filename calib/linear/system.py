@@ -33,7 +33,8 @@ class Linearisation:
             in units of the priors' sigmas; without the priors of the kept, and without the layout's
             other blocks. Its last diagonal entry is what of chi2 the eliminated cannot take away.
         raw: (S, S) the Gram matrix of the kept columns before anything was eliminated, where
-            gradients were asked for.
+            gradients were asked for; with all products of columns of one unknown, and of different
+            unknowns those that beams have.
         chi2: of all rows in it, before anything was eliminated.
         touched: (U,) bool, whether any beam or tracked body depends on a column.
         eliminated: what was eliminated, in that order.

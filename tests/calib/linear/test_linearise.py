@@ -66,8 +66,9 @@ def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, together):
     size = sizes(rows.T @ rows)
     unit = np.outer(size, size)
     np.testing.assert_allclose(linear.kept / unit, beyond.T @ beyond / unit, atol=1e-9)
-    raw = (rows.T @ rows)[:-1, :-1] / unit[:-1, :-1]
-    np.testing.assert_allclose(linear.raw / unit[:-1, :-1], raw, atol=1e-9)
+    raw, each = (rows.T @ rows)[:-1, :-1], np.repeat(*unknown_of(linear.layout))
+    one = each[:, None] == each
+    np.testing.assert_allclose(np.where(one, linear.raw - raw, 0.0) / unit[:-1, :-1], 0, atol=1e-9)
     assert linear.chi2 == pytest.approx(b @ b, rel=1e-9)
     # And the way back to what was eliminated: of directions, and of one with the right side.
     ahead = np.random.default_rng(2).normal(size=(len(kept) + 1, 3)) / size[:, None]
@@ -75,6 +76,12 @@ def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, together):
     np.testing.assert_allclose(back[kept], ahead[:-1], rtol=1e-12)
     limit = 1e-9 * np.abs(taken @ ahead).max(initial=1.0)
     np.testing.assert_allclose(back[gone], -taken @ ahead, atol=limit)
+
+
+def unknown_of(layout):
+    """Numbers of the kept unknowns, and how many columns each has."""
+    kept = layout.outer().values()
+    return np.arange(len(kept)), [unknown.dim for unknown in kept]
 
 
 def test_what_is_touched_and_how_sure_beams_are(case, together):
