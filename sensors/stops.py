@@ -23,6 +23,7 @@ _FELT = ("ax", "ay", "az")
 # offsets of cheap ones are 0.08 g at most (ADXL345, MPU-6050: data sheets).
 _OFF_REST = 0.1
 _FARTHEST_M = 1000.0  # a choice: no tracker sees so far; in millimetres, what is a metre away is
+_MEASURED = ("temperature_c", "payload_kg", "torque")  # columns, or their endings, of numbers only
 _LARGEST_JOINT = 4 * math.pi  # rad or m, a choice: wrists turn twice about at most
 
 
@@ -184,12 +185,17 @@ class CsvTable:
         return found
 
     def rest(self) -> dict[str, Array]:
-        """Give every other numeric column; one that is mostly numbers must be so throughout."""
-        for name, values in self._columns.items():
-            if values.dtype.kind != "f":
-                numeric = [escape.is_number(cell) for cell in values.tolist() if cell]
-                if 2 * sum(numeric) > len(numeric):
-                    self._loose(name, "leave a cell empty where the value is unknown")
+        """Give every other numeric column; one that is mostly numbers must be so throughout, and
+        so must one that is measured in numbers."""
+        why = "leave a cell empty where the value is unknown"
+        for name, values in list(self._columns.items()):
+            if values.dtype.kind == "f":
+                self.refuse(np.isinf(values), f"{name} is not finite; {why}")
+                continue
+            numeric = [escape.is_number(cell) for cell in values.tolist() if cell]
+            measured = name.rpartition(".")[2] in _MEASURED
+            if not all(numeric) and (measured or 2 * sum(numeric) > len(numeric)):
+                self._loose(name, why)
         return {name: column for name, column in self._columns.items() if column.dtype.kind == "f"}
 
     def _loose(self, name: str, why: str) -> Array:

@@ -180,27 +180,33 @@ def of_recording(recording: str, other: str) -> dict[str, Any]:
 
 
 def of_part(
-    name: str, sources: Sequence[Source], off_m: float, sigma_m: float, p: float
+    name: str, sources: Sequence[Source], off_m: tuple[float, float] | None, p: float
 ) -> dict[str, Any]:
-    """A part of the mesh whose beams were rejected as they agree on another place, in the same
-    form.
+    """A part of the mesh whose beams were rejected, in the same form.
 
     Args:
         name: as of `Group.what`.
         sources: the recordings.
-        off_m, sigma_m: residual of its beams, and of their mean; infinite where it is not known.
+        off_m: where they agree on another place, the residual of its beams and the sigma of that,
+            infinite where it is not known.
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
-    side = "long" if off_m > 0 else "short"
-    beams = f"its beams read {size_told(abs(off_m), sigma_m, 'm')} {side}"
     at_m = _at_m(group, sources)
-    said = f"{group}{_about(at_m)} is not where it was scanned: {beams}"
+    where, size, sigma = f"{group}{_about(at_m)}", None, None
+    if off_m is None:
+        said = f"beams do not end at {where}, but at all distances, as they do at glass or a mirror"
+    else:
+        size, sigma = abs(off_m[0]), off_m[1]
+        beams = (
+            f"its beams read {size_told(size, sigma, 'm')} {'long' if off_m[0] > 0 else 'short'}"
+        )
+        said = f"{where} is not where it was scanned: {beams}"
     return {
         **_otherwise("surface", name, MESH, whole(said)),
-        "size": abs(off_m),
+        "size": size,
         "unit": "m",
-        "sigma": sigma_m,
+        "sigma": sigma,
         "axis": ALONG_BEAMS,
         "at_m": at_m,
         "p_value": p,

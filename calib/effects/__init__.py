@@ -72,7 +72,7 @@ from calib.effects.range import (
     TemperatureDrift,
     WarmupDrift,
 )
-from calib.effects.reference import FaroScale, MeshShift, MovedSurface
+from calib.effects.reference import FaroScale, MeshSeamX, MeshSeamY, MeshShift, MovedSurface
 from calib.effects.rig import FrameOffset, LidarSlip, MountCreep, MountSettle, MountSlip
 from calib.effects.scatter import (
     JointScatter,
@@ -156,6 +156,8 @@ CATALOGUE: tuple[Effect, ...] = (
     TargetSphereOffset(),
     FaroScale(),
     MeshShift(),
+    MeshSeamX(),
+    MeshSeamY(),
     MovedSurface(),
     NoiseRange(),
     NoiseIncidence(),

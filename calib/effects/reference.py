@@ -8,6 +8,10 @@ from calib.effects.base import Effect, OneHot, Param, Site, View
 from calib.effects.basis import finite, place_of
 from calib.rig import Rig
 
+SEAMS = 3  # of a mesh, along each axis: a choice; seams between them are found from the next
+# Seams that are tried beside one, to either side, and how far apart: shares of the mesh's length.
+SEAMS_BESIDE, SEAM_STEP = 6, 0.02
+
 
 class FaroScale(Effect):
     """The scanner's metre is too long or too short. Its mesh and its spheres share that:
@@ -64,6 +68,50 @@ class MeshShift(Effect):
         shift = np.broadcast_to(np.eye(3), (len(point_m), 3, 3))
         turn = np.cross(np.eye(3)[:, None], point_m).transpose(1, 2, 0)
         return np.concatenate([shift, turn], axis=2)
+
+
+class MeshSeamX(MeshShift):
+    """Scans of the room were registered wrongly: beyond a seam across x the mesh is shifted and
+    turned against the rest of it."""
+
+    name = "mesh_seam_x"
+    formula = "surface = mesh + t + r x point, where x of the point > x_m; as `mesh_shift`"
+    typical = "1 to 10 mm and up to 2 mrad between scans, size assumed"
+    confounded_with = ("mesh_shift", "moved_surface", "faro_scale")
+    twin = ""
+    shape_name, shape, jumps = "x_m", 0.0, True
+    axis = 0  # across which seams run
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return super().params(rig) if rig.reference else ()
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        return self._seams(stops, np.arange(1, SEAMS + 1) / (SEAMS + 1))
+
+    def beside(self, stops: View) -> tuple[float, ...]:
+        around = np.arange(-SEAMS_BESIDE, SEAMS_BESIDE + 1) * SEAM_STEP
+        return self._seams(stops, around[around != 0.0], self.shape)
+
+    def basis(self, view: View) -> np.ndarray:
+        beyond = finite(view["point_m"])[:, self.axis] > self.shape
+        return super().basis(view) * beyond[:, None, None]
+
+    def _seams(self, stops: View, shares: np.ndarray, of: float | None = None) -> tuple[float, ...]:
+        """Seams inside the mesh at some shares of its length beyond one of them, or its end."""
+        if "mesh_box_m" not in stops.columns or not self.params(stops.rig):
+            return ()
+        low, high = stops["mesh_box_m"][0, :, self.axis]
+        at = (low if of is None else of) + shares * (high - low)
+        return tuple(float(f"{x:.4g}") for x in at if low < x < high)
+
+
+class MeshSeamY(MeshSeamX):
+    """The same beyond a seam across y."""
+
+    name = "mesh_seam_y"
+    formula = "surface = mesh + t + r x point, where y of the point > y_m; as `mesh_shift`"
+    shape_name = "y_m"
+    axis = 1
 
 
 class MovedSurface(Effect):

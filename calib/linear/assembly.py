@@ -329,9 +329,7 @@ class Assembly:
             found.setdefault(like, []).append(stop)
         return list(found.values())
 
-    def _stacked(
-        self, stops: Sequence[int], at: np.ndarray, width: int
-    ) -> tuple[np.ndarray, int]:
+    def _stacked(self, stops: Sequence[int], at: np.ndarray, width: int) -> tuple[np.ndarray, int]:
         """Own rows (K, m, width) of stops that are alike, in units of sigmas, and how many come
         before those of priors; `at` says where the columns of the first of them stand."""
         each = list(zip(*(self.waiting.get(stop, ()) for stop in stops), strict=True))

@@ -1,9 +1,9 @@
 """The columns of a linearisation: where each unknown stands, and which are eliminated.
 
 Unknowns are of three kinds. *Own* unknowns of a stop (where the rig stands, what its encoders
-misreport) are touched by that stop alone, or by nothing but their prior. *Cells* say how far parts of the mesh stand off the room;
-no row touches two of the finest cells, so their block of the normal equations is diagonal. All
-others are *kept*: they go to the factor graph.
+misreport) are touched by that stop alone, or by nothing but their prior. *Cells* say how far parts
+of the mesh stand off the room; no row touches two of the finest cells, so their block of the normal
+equations is diagonal. All others are *kept*: they go to the factor graph.
 """
 
 from __future__ import annotations

@@ -335,9 +335,12 @@ class Source:
         columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
+        if self.reference:
+            box_m = np.quantile(self.reference.vertices_m, [0.0, 1.0], axis=0)
+            columns["mesh_box_m"] = np.broadcast_to(box_m, (len(recording.stops), 2, 3))
         if self.rig.levels:
             columns["up"] = up_in_root(self.rig, recording)
-        return {**columns, **recording.covariates}
+        return {**recording.covariates, **columns}
 
 
 def recording_names(sources: Sequence[Source]) -> list[str]:

@@ -146,6 +146,7 @@ class _Checker:
             found.odd.extend(inventory.odd_stops(rig, recording))
             found.odd.extend(inventory.odd_times(recording))
             found.odd.extend(inventory.odd_copies(recording))
+            found.odd.extend(inventory.odd_columns(recording))
             found.odd.extend(inventory.odd_payloads(rig, recording))
             found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))

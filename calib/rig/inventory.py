@@ -29,6 +29,10 @@ LIGHTEST, HEAVIEST = 1.3, 1430.0
 # What the strongest arms for sale carry. No arm carries more than it weighs, either: of those for
 # sale a fifth (KR 1000) to a half (iiwa 14) of that.
 HEAVIEST_LOAD_KG = 2300.0
+# What stands for no number, such as -999, is at a tenth of the stops at most, and ten times as far
+# from the middle of all others as these are apart. Both are choices: 0 for 20 to 24 deg C is not
+# told.
+STAND_INS, BEYOND_REAL = 10, 10.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
 FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
@@ -92,7 +96,9 @@ def of_stops(rig: Rig, recording: RecordedStops) -> Iterator[Line]:
         given = np.isfinite(recording.base_guess).all(axis=1).sum()
         yield "base_guess", f"given at {given} of {count} stops"
     if recording.covariates:
-        yield "per-stop covariates", ", ".join(recording.covariates)
+        read = {n: int(np.isfinite(x).sum()) for n, x in recording.covariates.items()}
+        told = (n if k == count else f"{n} (at {k} of {count} stops)" for n, k in read.items())
+        yield "per-stop covariates", ", ".join(told)
 
 
 def of_targets(targets: Targets) -> Iterator[Line]:
@@ -209,6 +215,24 @@ def odd_copies(recording: RecordedStops) -> Iterator[str]:
             f"stops.csv holds joints and poses of one stop again at another, to every digit "
             f"({listed(pairs)}); a copy would count as a second measurement, so remove its row"
         )
+
+
+def odd_columns(recording: RecordedStops) -> Iterator[str]:
+    """Numbers that stand for none, such as -999: few, and far from all others of their column."""
+    for name, column in recording.covariates.items():
+        known = np.flatnonzero(np.isfinite(column))
+        away = np.abs(column[known] - np.median(column[known])) if len(known) else column[known]
+        order = known[np.argsort(away, kind="stable")]
+        for count in range(len(known) // STAND_INS, 0, -1):
+            near, far = column[order[:-count]], column[order[-count:]]
+            if np.abs(far - np.median(near)).min() > BEYOND_REAL * np.ptp(near) > 0.0:
+                where = listed([recording.stops[i] for i in sorted(order[-count:].tolist())])
+                numbers = " and ".join(f"{each:g}" for each in np.unique(far)[:3])
+                yield (
+                    f"{name} is {numbers} at {where} in stops.csv, and {near.min():g} to "
+                    f"{near.max():g} at all others; leave a cell empty where nothing was measured"
+                )
+                break
 
 
 def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:

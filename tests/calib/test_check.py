@@ -13,7 +13,14 @@ from calib.diagnosis.candidates import lacking
 from calib.problem.model import Model, Source
 from calib.results.check import check
 from calib.results.solution import solution_of
-from calib.rig.inventory import PlacedScan, odd_beams, odd_payloads, odd_rig, odd_times
+from calib.rig.inventory import (
+    PlacedScan,
+    odd_beams,
+    odd_columns,
+    odd_payloads,
+    odd_rig,
+    odd_times,
+)
 from calib.solve.fit import solve
 from chains import se3
 from chains.arm import Mass
@@ -368,3 +375,18 @@ def weighing(*kg: float, length_m: float = 0.4):
 def test_masses_that_no_arm_has_are_said(kg, said):
     assert [line for line in odd_rig(weighing(*kg)) if said is None or said not in line] == []
     assert len(list(odd_rig(weighing(*kg)))) == (said is not None)
+
+
+def test_numbers_that_stand_for_none():
+    def odd(*column):
+        stops = [f"P{i:02d}" for i in range(len(column))]
+        return list(odd_columns(SimpleNamespace(stops=stops, covariates={"lux": np.array(column)})))
+
+    usual = np.linspace(20.6, 24.0, 20)
+    (said,) = odd(*usual, -999.0, -999.0)
+    assert "lux is -999 at P20, P21" in said and "20.6 to 24 at all others" in said
+    (said,) = odd(*usual[:9], np.nan, 9999.0)
+    assert "9999 at P10" in said
+    # Neither a tail, nor a few columns of stops, nor what is switched on at one of them.
+    assert odd(*usual, 30.0) == odd(*usual[:5], -999.0) == odd(*[0.0] * 20, 5.0) == []
+    assert odd(*[np.nan] * 12) == odd() == []

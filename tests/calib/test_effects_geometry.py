@@ -297,6 +297,27 @@ def test_the_mesh_is_moved_as_a_rigid_body_and_the_spheres_are_not(source):
     assert not effect.of_scanner and find("faro_scale").of_scanner
 
 
+@pytest.mark.parametrize("name", ["mesh_seam_x", "mesh_seam_y"])
+def test_the_mesh_is_moved_beyond_a_seam_alone(source, name):
+    effect = find(name).at(0.5)
+    axis = "xyz".index(name[-1])
+    point_m = np.random.default_rng(0).normal(size=(40, 3))
+    view = View(source.rig, 40, {"point_m": point_m}, np.zeros((1, 6)))
+    beyond = point_m[:, axis] > 0.5
+    expected = find("mesh_shift").basis(view) * beyond[:, None, None]
+    np.testing.assert_array_equal(effect.basis(view), expected)
+    assert 0 < beyond.sum() < 40 and not effect.of_scanner and not effect.twin
+    # Seams lie inside the mesh, and those beside one to either side of it.
+    low, high = -4.0 + axis, 4.0
+    box_m = np.array([[[-4.0, -3.0, -1.0], [4.0, 4.0, 2.0]]])
+    stops = View(source.rig, 1, {"mesh_box_m": box_m}, np.zeros((1, 6)))
+    grid = np.array(find(name).shapes(stops))
+    np.testing.assert_allclose(grid, low + (high - low) * np.array([0.25, 0.5, 0.75]))
+    near = np.array(find(name).at(grid[0]).beside(stops))
+    assert (near < grid[0]).any() and (near > grid[0]).any() and (near > low).all()
+    assert not effect.shapes(View(source.rig, 1, {}, np.zeros((1, 6))))
+
+
 def test_labels_have_names_and_only_theirs_move(source, tmp_path):
     labels = source.rig.labels
     assert labels[0] == "floor" and list(labels) == sorted(labels)

@@ -23,6 +23,7 @@ from calib.diagnosis.verdict.matters import (
     weighed,
 )
 from calib.diagnosis.verdict.names import believed, dressed_up
+from calib.diagnosis.verdict.sentences import unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import find
 from calib.problem import build
@@ -183,7 +184,25 @@ def test_scatter_does_not_excuse_what_it_does_not_explain(look, times, doubted):
     falls = {"stop_range_scatter": Fall(9.0, times * 3.0, 3.0)}
     over = _over_the_expected(found, falls, rms_mm)
     assert over == pytest.approx(times)
-    assert (_unconfirmed(found, over) is not None) == doubted
+    assert _unconfirmed(found, over)[0] == doubted
+
+
+@pytest.mark.parametrize(
+    ("over", "shown", "doubted"),
+    [(1.2, True, False), (1.3, True, True), (1.3, False, False), (1.5, False, True)],
+)
+def test_a_large_held_out_error_is_nothing_adequate_though_no_test_says_why(
+    look, over, shown, doubted
+):
+    if not shown:
+        look = replace(look, unnamed=replace(look.unnamed, candidates=()))
+    found = Search([look], found=(), blunders=(), unnamed=(), scatter=None)
+    unsure, candidate = _unconfirmed(found, over)
+    assert unsure == doubted and (candidate is not None) == (shown and doubted)
+    if doubted:
+        said = unconfirmed(candidate, over)
+        assert f"{over} times as large as expected" in said
+        assert ("no test says why" in said) == (not shown)
 
 
 @pytest.mark.parametrize("structure", [True, False])

@@ -9,6 +9,7 @@ import pytest
 
 from calib.diagnosis.rejects import _p_values, _View, rejects
 from calib.diagnosis.rejects.counts import CellAxis
+from calib.diagnosis.rejects.found import Place, Rejects
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose, stand_of
 from calib.simulation import Spec, simulate
@@ -159,6 +160,52 @@ def test_returns_from_anywhere_are_told_where_they_are_many(studied, share, expl
     assert ("mixed pixels may explain" in found.sentence) != explained
     if not explained:
         assert diagnose(run).verdict == "unexplained_structure"
+
+
+@pytest.mark.parametrize(
+    ("share", "coherent", "said"),
+    [
+        (0.98, True, "is not where it was scanned: its beams read 12.5 ± 0.51 mm long"),
+        (0.98, False, "but at all distances, as they do at glass or a mirror"),
+        (0.065, True, ""),  # of a wall that stands where it was, few beams are rejected
+    ],
+)
+def test_a_part_of_the_mesh_is_wrong_where_most_of_its_beams_are(
+    share, coherent, said, monkeypatch
+):
+    monkeypatch.setattr("calib.blunders.told._at_m", lambda group, sources: None)
+    place = Place(
+        covariate="surface",
+        lower=5.0,
+        upper=5.0,
+        names=("5",),
+        p_adjusted=1e-4,
+        share=share,
+        rejected=0.5 * share,
+        beams=0.5,
+        residual_m=0.0125,
+        sigma_m=5.1e-4,
+        coherent=coherent,
+        short=0.4,
+    )
+    found = Rejects(
+        share=0.02,
+        expected=0.01,
+        p_adjusted=1e-4,
+        places=[place],
+        meshed=True,
+        clutter=0.0,
+        clutter_stops=(),
+        beyond=False,
+        beyond_m=None,
+    )
+    assert not found.explained
+    blunders, left = found.blunders([]), found.unexplained()
+    assert len(blunders) == bool(said) and len(left) == (not said)
+    for each in blunders:
+        assert said in each["sentence"] and each["without"] == "mesh:surface_5"
+        assert (each["size"] is None) == (not coherent)
+        assert (each["sigma"] is None) == (not coherent)
 
 
 def test_too_few_stops_or_no_scans_claim_nothing(tmp_path):

@@ -170,6 +170,20 @@ def test_a_covariate_that_is_mostly_numbers_must_be_so_throughout(write):
         open_cart(write(HEADER + ",temperature_c", rows))
 
 
+@pytest.mark.parametrize("name", ["temperature_c", "flange.payload_kg", "j1.torque"])
+def test_what_is_measured_in_numbers_is_none_with_a_unit_and_never_infinite(write, name):
+    def opened(cells, name=name):
+        rows = [row + "," + cell for row, cell in zip(ROWS, cells, strict=True)]
+        return open_cart(write(HEADER + f",{name}", rows))
+
+    with pytest.raises(InputError, match=rf"row 1 \(a\): {name} is '20.1 C', not a number"):
+        opened(["20.1 C", "20.2 C", ""])
+    with pytest.raises(InputError, match=rf"row 2 \(b\): {name} is not finite; leave a cell empty"):
+        opened(["20", "inf", "21"])
+    assert not opened(["warm", "cold", ""], name="weather").covariates
+    np.testing.assert_array_equal(opened(["20", "", "21"]).covariates[name], [20, np.nan, 21])
+
+
 def test_a_folder_without_stops_is_named(tmp_path):
     with pytest.raises(InputError, match=r"stops\.csv does not exist"):
         open_cart(tmp_path)

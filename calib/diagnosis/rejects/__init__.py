@@ -177,7 +177,8 @@ def _p_values(view: _View, mine: np.ndarray) -> np.ndarray:
         k = np.bincount(cluster[mine] * bins + of, minlength=n.size).reshape(n.shape)
         rest = every[:, None] - n, k.sum(axis=1)[:, None] - k
         (here, some), (there, many) = _apart(n, k), _apart(*rest)
-        variance += np.square(here - there).sum(axis=0)
+        with np.errstate(invalid="ignore"):  # of one cluster, and of all beams, nothing is known
+            variance += np.square(here - there).sum(axis=0)
         dof = np.minimum(dof, np.minimum(some, many) - 1.0)
     least = mean * (1.0 - mean) / np.maximum(rows, 1)
     t = (share - others) / np.sqrt(np.maximum(variance, least))

@@ -168,18 +168,26 @@ class Rejects:
     @property
     def moved(self) -> Sequence[Place]:
         """Those of them that are surfaces, or parts, which stand elsewhere than the mesh has
-        them."""
+        them: hardly any of their beams is as it should be."""
+        return [place for place in self._wrong if place.coherent]
+
+    @property
+    def _wrong(self) -> Sequence[Place]:
+        """Surfaces of a mesh, or parts, most of whose beams were rejected."""
         mine = (place for place in self.structured if place.covariate in MESH_PARTS)
-        return [place for place in mine if place.coherent and self.meshed]
+        return [place for place in mine if self.meshed and place.share > STRUCTURED_SHARE]
 
     def blunders(self, sources: Sequence[Source]) -> list[dict[str, Any]]:
         """These as blunders in diagnosis.json, to be left out; of these recordings."""
-        parts = (
-            (part_of_mesh(each.covariate, name), each) for each in self.moved for name in each.names
-        )
         return [
-            told.of_part(name, sources, place.residual_m, place.sigma_m, place.p_adjusted)
-            for name, place in parts
+            told.of_part(
+                part_of_mesh(place.covariate, name),
+                sources,
+                (place.residual_m, place.sigma_m) if place.coherent else None,
+                place.p_adjusted,
+            )
+            for place in self._wrong
+            for name in place.names
         ]
 
     @property
@@ -215,7 +223,7 @@ class Rejects:
                 "formula": place.formula(),
             }
             for place in self.structured
-            if place not in self.moved
+            if place not in self._wrong
         ]
 
     def document(self) -> dict[str, Any]:

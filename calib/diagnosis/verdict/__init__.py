@@ -170,19 +170,19 @@ def conclude(
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
     over = _over_the_expected(found, held_out, judged_mm(summary))
-    doubt = None if blunders or more else _unconfirmed(found, over)
-    calm = BAD if forbids else UNNAMED if doubt else "adequate"
+    unsure, doubt = (False, None) if blunders or more else _unconfirmed(found, over)
+    calm = BAD if forbids else UNNAMED if unsure else "adequate"
     answer = hold and not formulas.needless
-    verdict = BAD if blunders else _verdict(found, answer, more, bool(doubt), calm)
+    verdict = BAD if blunders else _verdict(found, answer, more, unsure, calm)
     stands_in = verdict == UNNAMED or formulas.instead
     worn = dressed_up(found, held_out, hold, formulas) if stands_in else [*formulas.needless]
     deferred = not found.scatter_judged and (verdict == UNNAMED or bool(formulas.formulas))
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
-    untestable, unsure = _untestable(first), unconfirmed(doubt, over) if doubt else ""
+    untestable, said = _untestable(first), unconfirmed(doubt, over) if unsure else ""
     last = [*lasting(found.blunders, first.checked, first.stand.sources)]
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
-    sentences = sentences_of(*told_of, deferred=deferred, doubt=unsure)
+    sentences = sentences_of(*told_of, deferred=deferred, doubt=said)
     _caution(sentences, verdict, formulas, rejected, () if blunders else forbids)
     sentences += _drifts(found, unexplained)
     return Diagnosis(
@@ -257,18 +257,20 @@ def _over_the_expected(
     return 0.0 if unknown else error / floor
 
 
-def _unconfirmed(found: Search, over: float) -> Candidate | None:
-    """Structure that single beams show, where the held-out error is larger than chance makes it and
-    no structure or effect is found: so few stops, or walls, see each part of it that they may
-    differ by chance as much. None where beams scatter by themselves so widely that the error is as
-    expected of them."""
+def _unconfirmed(found: Search, over: float) -> tuple[bool, Candidate | None]:
+    """Whether the held-out error is larger than chance makes it and no structure or effect is
+    found, and structure that single beams show: so few stops, or walls, see each part of it that
+    they may differ by chance as much. Without any the error has to be larger still. Not where
+    beams scatter by themselves so widely that the error is as expected of them."""
     there = (
         found.unnamed or found.found or found.at_first or not found.looks[0].stand.estimate.scans
     )
     most = HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE
-    if there or over <= most or over <= most * found.looks[-1].stand.beams.alone:
-        return None
-    return next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
+    alone = max(1.0, found.looks[-1].stand.beams.alone)
+    if there or over <= most * alone:
+        return False, None
+    shown = next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
+    return shown is not None or over > HELD_OUT_BESIDE_SCATTER * alone, shown
 
 
 def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:

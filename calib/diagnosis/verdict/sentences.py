@@ -12,6 +12,7 @@ from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import all_of, in_words, words
+from calib.diagnosis.verdict.alike import columns_alike
 from calib.diagnosis.verdict.matters import Weighed
 from calib.results.holdout import TAKEN_BACK, from_to
 
@@ -99,15 +100,20 @@ def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
     return [each.sentence for each in found.chance]
 
 
-def unconfirmed(candidate: Candidate, over: float) -> str:
-    """Of structure that too few stops see for any test to confirm it, where the held-out error is
-    so many times the expected one."""
+def unconfirmed(candidate: Candidate | None, over: float) -> str:
+    """Of structure that too few stops see for any test to confirm it, or of none, where the
+    held-out error is so many times the expected one."""
+    much = f"The held-out error is {over:.1f} times as large as expected, and no test "
+    if candidate is None:
+        return (
+            f"{much}says why. Something is wrong that neither a known effect nor structure "
+            "describes, or an instrument errs more than rig.yaml says."
+        )
     what = in_words(candidate.effect)
     return (
-        f"The held-out error is {over:.1f} times as large as expected, and no test confirms why. "
-        f"Taken one by one, the beams show residuals that depend on {what}, but too few stops or "
-        "surfaces see each part of that dependence to rule out chance. Stops that face other "
-        "surfaces would decide it."
+        f"{much}confirms why. Taken one by one, the beams show residuals that depend on {what}, "
+        "but too few stops or surfaces see each part of that dependence to rule out chance. Stops "
+        "that face other surfaces would decide it."
     )
 
 
@@ -218,6 +224,10 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     ]
     if step.effect.twin:
         out.append(f"Nothing that was measured tells it from {step.effect.twin}.")
+    out += [
+        f"At these stops {other} goes with {name}, so nothing tells which of the two it follows."
+        for name, other in columns_alike(step)
+    ]
     out += [
         f"Nothing that was measured tells it from {all_of(pair['effects'])} together."
         for pair in candidate["together"][:MOST_LISTED]

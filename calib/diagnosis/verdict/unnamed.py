@@ -199,12 +199,13 @@ def _thrown(before: Errors, after: Errors) -> tuple[float, float]:
 
 def _better(before: Errors, named: Errors, after: Errors) -> bool:
     """Whether unseen stops are predicted better after formulas took the place of names, by as much
-    as matters, and no more beams are rejected; or far fewer are, and these fit."""
+    as matters, than with these or before them, and no more beams are rejected; or far fewer are,
+    and these fit."""
     now, then = _thrown(named, after)
     if now - then > TAKEN_BACK:
         return _by_chance(after) or after.size.judged_mm <= named.size.judged_mm
     least = FALL_MATTERS * before.size.judged_mm
-    falls = after.size.judged_mm < named.size.judged_mm - least
+    falls = after.size.judged_mm < min(named.size.judged_mm, before.size.judged_mm) - least
     return falls and then - now <= TAKEN_BACK
 
 

@@ -127,7 +127,7 @@ def formulas(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield Absent("formula", f"not diagnosed; 'rigcal diagnose {evidence.run.folder}' does it")
         return
     found = charts_of(evidence.diagnosis)
-    yield from found or [Absent("formula", "the diagnosis found no formula for residual structure")]
+    yield from found or [Absent("formula", "the diagnosis found no formula beyond this model")]
 
 
 def charts_of(diagnosis: Mapping[str, Any] | None, narrow: bool = False) -> list[Chart]:
