@@ -10,7 +10,7 @@ from calib.diagnosis.search import NamedEffect
 from calib.diagnosis.verdict.matters import NOTABLE
 from calib.problem.model import Source
 
-WHEN = ("time_s", "elapsed_s")
+CLOCKS = ("time_s", "elapsed_s")
 
 
 def columns_alike(step: NamedEffect) -> Iterator[tuple[str, str]]:
@@ -24,7 +24,7 @@ def columns_alike(step: NamedEffect) -> Iterator[tuple[str, str]]:
     known = _columns(sources)
     for name in (c for c in effect.covariates if c in known):
         for other in sorted(known):
-            same = other == name or (other in WHEN and name in WHEN)
+            same = other == name or (other in CLOCKS and name in CLOCKS)
             if not same and sigmas * _apart(known[name], known[other]) < NOTABLE:
                 yield name, other
 
@@ -32,7 +32,7 @@ def columns_alike(step: NamedEffect) -> Iterator[tuple[str, str]]:
 def _columns(sources: Sequence[Source]) -> dict[str, np.ndarray]:
     """Numbers that every recording has of its stops, (K,) over all of these, and that differ."""
     first, *others = sources
-    names = [n for n in (*first.recording.covariates, *WHEN) if n in first.columns]
+    names = [n for n in (*first.recording.covariates, *CLOCKS) if n in first.columns]
     names = [n for n in names if all(n in source.columns for source in others)]
     every = {n: np.concatenate([s.columns[n] for s in sources]) for n in names}
     return {n: column for n, column in every.items() if np.nanstd(column) > 0.0}
