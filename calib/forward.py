@@ -105,7 +105,9 @@ def stacked(
     if isinstance(first, RowsOf) and all(
         isinstance(each, RowsOf) and each.whole is first.whole for each in bases
     ):
-        return dict(RowsOf(first.whole, np.concatenate([each.index for each in bases])))
+        index = np.concatenate([each.index for each in bases])
+        every = np.array_equal(index, np.arange(max(map(len, first.whole.values()), default=0)))
+        return dict(first.whole if every else RowsOf(first.whole, index))
     each = {
         n: [np.broadcast_to(b[n], (k, *b[n].shape[1:])) for b, k in zip(bases, counts, strict=True)]
         for n in first
@@ -120,7 +122,8 @@ class Stops:
     Args:
         rig: the rig on paper.
         joints: (K, J) reported joints, rad or m.
-        edge_bases: variable -> (K or 1, E, 6, P), the twist of each edge per unit.
+        edge_bases: variable -> (K or 1, e, 6, P), the twists of the edges that it moves, per unit.
+        edges: variable -> (e,) which of the E edges these are.
         joint_bases: variable -> (K or 1, J, P), the joint error per unit.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
@@ -130,6 +133,7 @@ class Stops:
     rig: Rig
     joints: np.ndarray
     edge_bases: Mapping[str, np.ndarray]
+    edges: Mapping[str, np.ndarray]
     joint_bases: Mapping[str, np.ndarray]
     root: str
     reference: str | None
@@ -165,14 +169,22 @@ class Stops:
         `NOISE`, with values (K, 4, 4) and (K, J): one for each stop."""
         first, counts = stops[0], [len(s.joints) for s in stops]
         return cls(
-            first.rig,
-            np.concatenate([s.joints for s in stops]),
-            stacked([s.edge_bases for s in stops], counts),
-            stacked([s.joint_bases for s in stops], counts),
+            rig=first.rig,
+            joints=np.concatenate([s.joints for s in stops]),
+            edge_bases=stacked([s.edge_bases for s in stops], counts),
+            edges=first.edges,
+            joint_bases=stacked([s.joint_bases for s in stops], counts),
             root=ROOT,
             reference=first.reference,
             noise=None if first.noise is None else NOISE,
         )
+
+    def at_edges(self, name: str, twists: np.ndarray) -> np.ndarray:
+        """Twists (k, e, 6, ...) of the edges that an unknown moves, among those of all (k, E, ...),
+        the others zero."""
+        out = np.zeros((len(twists), len(self.rig.tree.edges), *twists.shape[2:]))
+        out[:, self.edges[name]] = twists
+        return out
 
     def in_root(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_root_frame under all effects of edges and joints; here and below, without
@@ -183,13 +195,15 @@ class Stops:
         for name, basis in self.joint_bases.items():
             joints = joints + np.matvec(basis, values[name])
         for name, basis in self.edge_bases.items():
-            twists = twists + basis @ values[name]
+            twists = twists + self.at_edges(name, basis @ values[name])
         if not derivatives:
             return Placed(self.rig.tree.transform(frame, joints, twists), {})
         placed = self.rig.tree.place(frame, joints, twists)
         count = len(joints)
-        by_twist = placed.d_twist.reshape(count, 6, -1)
-        d = {n: by_twist @ _flat(basis) for n, basis in self.edge_bases.items()}
+        d = {
+            name: placed.d_twist[:, :, self.edges[name]].reshape(count, 6, -1) @ _flat(basis)
+            for name, basis in self.edge_bases.items()
+        }
         for name, basis in self.joint_bases.items():
             d[name] = d.get(name, 0.0) + placed.d_joint @ basis
         if self.noise is not None:
@@ -266,10 +280,12 @@ def place(
         }
         for site in (Site.EDGE, Site.JOINTS)
     }
+    moved = {n: np.flatnonzero(b.any(axis=(0, 2, 3))) for n, b in at[Site.EDGE].items()}
     return Stops(
         rig=rig,
         joints=joints,
-        edge_bases=at[Site.EDGE],
+        edge_bases={n: basis[:, moved[n]] for n, basis in at[Site.EDGE].items()},
+        edges=moved,
         joint_bases=at[Site.JOINTS],
         root=root,
         reference=reference,

@@ -303,7 +303,8 @@ class Assembly:
         place = positions(self.layout.size, self.layout.kept)[columns]
         first = [at.start for at in self.layout.at.values()]
         of = np.searchsorted(first, columns, side="right")
-        for some in np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1):
+        each = np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1)
+        for some in each if len(columns) else ():
             mine = rows[:, :, some[0] : some[-1] + 1].reshape(-1, len(some))
             self.raw[np.ix_(place[some], place[some])] += mine.T @ mine
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calib.problem.model import labels
 from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role, Unknown
 from calib.residuals.scan import ScanStop
@@ -87,13 +88,7 @@ class Layout:
             seen = {stops.setdefault(key, len(stops)) for key in keys_of(block)}
             for name in block.variables:
                 touched.setdefault(name, set()).update(seen or {-1})
-        owner: dict[str, int] = {}
-        for name, unknown in unknowns.items():
-            if unknown.role not in (Role.PLACE, Role.JOINTS) or name in kept:
-                continue
-            seen = touched.get(name) or {stops.setdefault((name, 0), len(stops))}
-            if len(seen) == 1:
-                (owner[name],) = seen
+        owner = {n: stop for n, stop in _owners(problem, stops, touched) if n not in kept}
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
             own.setdefault(owner[name], []).append(np.r_[at[name]])
@@ -169,6 +164,26 @@ def positions(size: int, columns: np.ndarray) -> np.ndarray:
 def key_of(scan: ScanStop) -> StopKey:
     """Which stop a scan is of."""
     return scan.recording.folder, scan.index
+
+
+def _owners(
+    problem: Problem, stops: dict[StopKey, int], touched: Mapping[str, Collection[int]]
+) -> Iterator[tuple[str, int]]:
+    """Unknowns of one stop alone, and its number: of those that nothing touches, the stop that they
+    are of, which gets one where it has none."""
+    known = {
+        (label, stop): (source.recording.folder, k)
+        for source, label in zip(problem.sources, labels(problem.sources), strict=True)
+        for k, stop in enumerate(source.recording.stops)
+    }
+    for name, unknown in problem.variables.items():
+        if unknown.role not in (Role.PLACE, Role.JOINTS):
+            continue
+        seen = touched.get(name, ())
+        if not seen and (key := known.get((unknown.owner.recording, unknown.owner.where))):
+            seen = (stops.setdefault(key, len(stops)),)
+        if len(seen) == 1:
+            yield name, next(iter(seen))
 
 
 def keys_of(block: Block) -> Sequence[StopKey]:

@@ -245,7 +245,8 @@ def _free_edge(problem: Problem, scan: ScanStop) -> tuple[str, int] | None:
     path = scan.stops.rig.tree.path(scan.stops.rig.lidar_frame)
     if not path:  # it is the rig's root
         return None
-    for name, basis in scan.stops.edge_bases.items():
+    for name, moved in scan.stops.edge_bases.items():
+        basis = scan.stops.at_edges(name, moved)
         turns = np.flatnonzero(np.any(basis[0, path[-1], :3] != 0, axis=0))
         same = len(basis) == 1 and name in problem.calibration
         if same and np.array_equal(basis[0, path[-1], :3][:, turns], np.eye(3)):

@@ -184,7 +184,7 @@ class Scene:
         edges = len(stops.rig.tree.edges)
         twists, jacobians, numbers = np.zeros((edges, 6)), [np.zeros((edges, 6, 0))], []
         for name, bases in stops.edge_bases.items():
-            basis = bases[row if len(bases) > 1 else 0]
+            (basis,) = stops.at_edges(name, bases[[row if len(bases) > 1 else 0]])
             twists += basis @ self.state[name]
             jacobians.append(basis)
             numbers += [known.get(key) for key in self.problem.variables[name].keys]

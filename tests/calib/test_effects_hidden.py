@@ -162,7 +162,7 @@ def test_every_shape_to_try_is_another_effect(whole, effect):
     )
     stops, seen = stops_of(source), []
     views = [stops]
-    if effect.site is Site.BEAM:
+    if effect.site in (Site.BEAM, Site.REFERENCE):
         views = [scan.rows(values).view for scan in problem.scans]
     shapes = effect.shapes(stops)
     assert len(set(shapes)) == len(shapes) > 2

@@ -23,7 +23,7 @@ from calib.diagnosis.verdict.matters import (
     weighed,
 )
 from calib.diagnosis.verdict.names import believed, dressed_up
-from calib.diagnosis.verdict.sentences import unconfirmed
+from calib.diagnosis.verdict.sentences import _first_sentences, unconfirmed
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import find
 from calib.problem import build
@@ -185,6 +185,17 @@ def test_scatter_does_not_excuse_what_it_does_not_explain(look, times, doubted):
     over = _over_the_expected(found, falls, rms_mm)
     assert over == pytest.approx(times)
     assert _unconfirmed(found, over)[0] == doubted
+
+
+@pytest.mark.parametrize(("scans", "said"), [(0, ""), (1, "scans of 1 stop are"), (4, "")])
+def test_an_adequate_model_of_few_scans_says_that_they_are_few(look, scans, said):
+    stand = SimpleNamespace(
+        model=look.stand.model, estimate=SimpleNamespace(scans=look.stand.estimate.scans[:scans])
+    )
+    few = SimpleNamespace(linear=look.linear, named=look.named, unnamed=look.unnamed, stand=stand)
+    first, *rest = _first_sentences("adequate", few, False)
+    assert first.startswith("The model is adequate")
+    assert (said in rest[0] and "4 are the least" in rest[0]) if said else not rest
 
 
 @pytest.mark.parametrize(

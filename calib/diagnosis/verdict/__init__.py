@@ -266,11 +266,10 @@ def _unconfirmed(found: Search, over: float) -> tuple[bool, Candidate | None]:
         found.unnamed or found.found or found.at_first or not found.looks[0].stand.estimate.scans
     )
     most = HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE
-    alone = max(1.0, found.looks[-1].stand.beams.alone)
-    if there or over <= most * alone:
+    if there or over <= most or over <= most * (alone := found.looks[-1].stand.beams.alone):
         return False, None
     shown = next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
-    return shown is not None or over > HELD_OUT_BESIDE_SCATTER * alone, shown
+    return shown is not None or over > HELD_OUT_BESIDE_SCATTER * max(1.0, alone), shown
 
 
 def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:

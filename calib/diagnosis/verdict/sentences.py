@@ -133,6 +133,12 @@ def _first_sentences(verdict: str, look: Look, beside: bool) -> list[str]:
         f"{len(look.unnamed.candidates)} kinds of structure none "
         f"{'that matters ' if beside else ''}is significant."
     ]
+    scans = len(look.stand.estimate.scans)
+    if 0 < scans < FEWEST_STOPS:
+        out.append(
+            f"No effect of the LiDAR could be told: scans of {scans} stop{'s' * (scans > 1)} are "
+            f"too few, and {FEWEST_STOPS} are the least."
+        )
     described = [effect.name for effect in look.stand.model.effects if effect.seen]
     if described:
         out.append(
