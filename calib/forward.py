@@ -165,8 +165,8 @@ class Stops:
 
     @classmethod
     def together(cls, stops: Sequence[Stops]) -> Stops:
-        """Stops that share all but their own unknowns, as one. Its own are called `ROOT` and
-        `NOISE`, with values (K, 4, 4) and (K, J): one for each stop."""
+        """Stops of one `place` that share all but their own unknowns, as one. Its own are called
+        `ROOT` and `NOISE`, with values (K, 4, 4) and (K, J): one for each stop."""
         first, counts = stops[0], [len(s.joints) for s in stops]
         return cls(
             rig=first.rig,

@@ -186,7 +186,7 @@ class CsvTable:
 
     def rest(self) -> dict[str, Array]:
         """Give every other numeric column; one that is mostly numbers must be so throughout, and
-        so must one that is measured in numbers."""
+        so must one that is measured in numbers; none is infinite."""
         why = "leave a cell empty where the value is unknown"
         for name, values in list(self._columns.items()):
             if values.dtype.kind == "f":

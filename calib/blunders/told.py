@@ -188,26 +188,24 @@ def of_part(
         name: as of `Group.what`.
         sources: the recordings.
         off_m: where they agree on another place, the residual of its beams and the sigma of that,
-            infinite where it is not known.
+            NaN where it is not known.
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
     at_m = _at_m(group, sources)
-    where, size, sigma = f"{group}{_about(at_m)}", None, None
+    where, off = f"{group}{_about(at_m)}", {}
     if off_m is None:
         said = f"beams do not end at {where}, but at all distances, as they do at glass or a mirror"
     else:
         size, sigma = abs(off_m[0]), off_m[1]
+        off = {"size": size, "unit": "m", "sigma": sigma, "axis": ALONG_BEAMS}
         beams = (
             f"its beams read {size_told(size, sigma, 'm')} {'long' if off_m[0] > 0 else 'short'}"
         )
         said = f"{where} is not where it was scanned: {beams}"
     return {
         **_otherwise("surface", name, MESH, whole(said)),
-        "size": size,
-        "unit": "m",
-        "sigma": sigma,
-        "axis": ALONG_BEAMS,
+        **off,
         "at_m": at_m,
         "p_value": p,
         "p_adjusted": p,
@@ -322,7 +320,8 @@ def size_told(size: float, sigma: float, unit: str) -> str:
     if scale * size >= LARGE_SIZE:
         in_deg = f" ({np.degrees(size):.3g} deg)" if unit == "rad" else ""
         return f"{size:.3g} {unit}{in_deg}"
-    return f"{scale * size:.3g} ± {scale * sigma:.2g} {name}"
+    known = f" ± {scale * sigma:.2g}" if np.isfinite(sigma) else ""
+    return f"{scale * size:.3g}{known} {name}"
 
 
 def _wrong_sign(left: LeftOut, rig: Rig) -> str | None:

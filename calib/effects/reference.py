@@ -8,6 +8,10 @@ from calib.effects.base import Effect, OneHot, Param, Site, View
 from calib.effects.basis import finite, place_of
 from calib.rig import Rig
 
+RIGID = (
+    *(Param(n, "m", 0.005) for n in ("tx", "ty", "tz")),
+    *(Param(n, "rad", 0.001) for n in ("rx", "ry", "rz")),
+)
 SEAMS = 3  # of a mesh, along each axis: a choice; seams between them are found from the next
 # Seams that are tried beside one, to either side, and how far apart: shares of the mesh's length.
 SEAMS_BESIDE, SEAM_STEP = 6, 0.02
@@ -34,8 +38,8 @@ class FaroScale(Effect):
 
 
 class MeshShift(Effect):
-    """The mesh is not in the frame of the spheres: a scan was registered wrongly, or the mesh was
-    exported in another frame.
+    """The mesh is not in the frame of the spheres: the scanner was set up again between them, or
+    the mesh was exported in another frame.
 
     A tracker whose frame was set anew between the targets and the stops looks the very same. Which
     of the two it is decides where the reference's frame is.
@@ -57,11 +61,7 @@ class MeshShift(Effect):
         return False
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        if not (rig.reference and rig.target):
-            return ()
-        return tuple(Param(n, "m", 0.005) for n in ("tx", "ty", "tz")) + tuple(
-            Param(n, "rad", 0.001) for n in ("rx", "ry", "rz")
-        )
+        return RIGID if rig.reference and rig.target else ()
 
     def basis(self, view: View) -> np.ndarray:
         point_m = finite(view["point_m"])
@@ -76,14 +76,14 @@ class MeshSeamX(MeshShift):
 
     name = "mesh_seam_x"
     formula = "surface = mesh + t + r x point, where x of the point > x_m; as `mesh_shift`"
-    typical = "1 to 10 mm and up to 2 mrad between scans, size assumed"
+    typical = "1 to 10 mm and up to 1 mrad between scans, size assumed"
     confounded_with = ("mesh_shift", "moved_surface", "faro_scale")
     twin = ""
     shape_name, shape, jumps = "x_m", 0.0, True
     axis = 0  # across which seams run
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return super().params(rig) if rig.reference else ()
+        return RIGID if rig.reference else ()  # whatever tells where the mesh is as a whole
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return self._seams(stops, np.arange(1, SEAMS + 1) / (SEAMS + 1))
@@ -102,7 +102,7 @@ class MeshSeamX(MeshShift):
             return ()
         low, high = stops["mesh_box_m"][0, :, self.axis]
         at = (low if of is None else of) + shares * (high - low)
-        return tuple(float(f"{x:.4g}") for x in at if low < x < high)
+        return tuple(float(f"{x:.6g}") for x in at if low < x < high)
 
 
 class MeshSeamY(MeshSeamX):

@@ -22,7 +22,7 @@ from calib.problem import Problem
 from calib.problem.model import Source
 from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, columns_at, joint_range, placed
-from calib.rig.columns import stop_columns
+from calib.rig.columns import recorded_columns, stop_columns
 from calib.runs.asked.factors import estimate_of, prior_of
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
@@ -212,7 +212,7 @@ def _read(path: Path, source: Source) -> tuple[list[str], np.ndarray, dict[str, 
     names = table.names()
     joints, times = table.joints(rig.joint_names), table.times("time_s")
     rest = table.rest()
-    return names, joints, {**stop_columns(rig, joints, times, rest), **rest}
+    return names, joints, {**stop_columns(rig, joints, times, rest), **recorded_columns(rest)}
 
 
 def _apart(drawn: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -41,7 +41,8 @@ class Layout:
         bodies: the problem's blocks of seen bodies that depend on stops' own unknowns.
         others: the problem's other blocks; the graph takes them as they are.
         unbounded: unknowns that have no prior.
-        scanned: how many stops have beams.
+        scanned, measured: how many stops have beams, and beams or tracked bodies: their numbers are
+            the first.
         touched: unknown -> numbers of the stops whose place, or tracked bodies, depend on it; -1
             for a target.
         asked: names of unknowns -> their columns, of those that were asked for.
@@ -60,6 +61,7 @@ class Layout:
     others: Sequence[Block]
     unbounded: frozenset[str]
     scanned: int
+    measured: int
     touched: Mapping[str, frozenset[int]]
     asked: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
@@ -88,7 +90,11 @@ class Layout:
             seen = {stops.setdefault(key, len(stops)) for key in keys_of(block)}
             for name in block.variables:
                 touched.setdefault(name, set()).update(seen or {-1})
-        owner = {n: stop for n, stop in _owners(problem, stops, touched) if n not in kept}
+        measured = len(stops)
+        owner = {n: next(iter(s)) for n, s in touched.items() if len(s) == 1 and _own(unknowns[n])}
+        for name, key in _untouched(problem, touched):
+            owner[name] = stops.setdefault(key, len(stops))
+        owner = {name: stop for name, stop in owner.items() if name not in kept}
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
             own.setdefault(owner[name], []).append(np.r_[at[name]])
@@ -115,6 +121,7 @@ class Layout:
             others=others,
             unbounded=frozenset(unbounded),
             scanned=len({key_of(scan) for scan in problem.scans}),
+            measured=measured,
             touched={name: frozenset(seen) for name, seen in touched.items()},
         )
 
@@ -166,24 +173,22 @@ def key_of(scan: ScanStop) -> StopKey:
     return scan.recording.folder, scan.index
 
 
-def _owners(
-    problem: Problem, stops: dict[StopKey, int], touched: Mapping[str, Collection[int]]
-) -> Iterator[tuple[str, int]]:
-    """Unknowns of one stop alone, and its number: of those that nothing touches, the stop that they
-    are of, which gets one where it has none."""
+def _own(unknown: Unknown) -> bool:
+    """Whether a stop may have it for itself."""
+    return unknown.role in (Role.PLACE, Role.JOINTS)
+
+
+def _untouched(problem: Problem, touched: Collection[str]) -> Iterator[tuple[str, StopKey]]:
+    """Unknowns of a stop that no row but their prior depends on, and which stop that is."""
     known = {
         (label, stop): (source.recording.folder, k)
         for source, label in zip(problem.sources, labels(problem.sources), strict=True)
         for k, stop in enumerate(source.recording.stops)
     }
     for name, unknown in problem.variables.items():
-        if unknown.role not in (Role.PLACE, Role.JOINTS):
-            continue
-        seen = touched.get(name, ())
-        if not seen and (key := known.get((unknown.owner.recording, unknown.owner.where))):
-            seen = (stops.setdefault(key, len(stops)),)
-        if len(seen) == 1:
-            yield name, next(iter(seen))
+        of = unknown.owner.recording, unknown.owner.where
+        if _own(unknown) and name not in touched and of in known:
+            yield name, known[of]
 
 
 def keys_of(block: Block) -> Sequence[StopKey]:

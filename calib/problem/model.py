@@ -17,7 +17,7 @@ from calib.forward import Term, named
 from calib.residuals.groups import JOINTS, Group, GroupKind
 from calib.residuals.store import BeamStore
 from calib.rig import Rig, load_rig
-from calib.rig.columns import stop_columns, tracked_poses, up_in_root
+from calib.rig.columns import recorded_columns, stop_columns, tracked_poses, up_in_root
 from calib.rig.recording import recorded
 from chains import remote
 from chains.errors import InputError
@@ -336,11 +336,12 @@ class Source:
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)
         if self.reference:
-            box_m = np.quantile(self.reference.vertices_m, [0.0, 1.0], axis=0)
+            at_m = self.reference.vertices_m
+            box_m = np.stack([at_m.min(axis=0), at_m.max(axis=0)])
             columns["mesh_box_m"] = np.broadcast_to(box_m, (len(recording.stops), 2, 3))
         if self.rig.levels:
             columns["up"] = up_in_root(self.rig, recording)
-        return {**recording.covariates, **columns}
+        return {**columns, **recorded_columns(recording.covariates)}
 
 
 def recording_names(sources: Sequence[Source]) -> list[str]:

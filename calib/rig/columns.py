@@ -24,8 +24,7 @@ def stop_columns(
 
     Each joint by its name as reported, rad or m; ``torques`` (K, J), N m or N, where any column
     ``<joint>.torque`` was recorded; ``payload_kg`` of the first tip where ``<tip>.payload_kg`` of
-    any was; ``temperature_c``, where it was read at some stops only, at the others as it is at
-    these on average; and, where the times are known: ``time_s``;
+    any was; and, where the times are known: ``time_s``;
     ``elapsed_s`` since the first stop; ``travel.<joint>``, how far a joint went since the stop
     before, rad or m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first both are 0: nothing
     is known of it.
@@ -44,7 +43,7 @@ def stop_columns(
     if any(name in recorded for name in torques.values()):
         unknown = np.full(len(joints), np.nan)
         columns["torques"] = np.stack([recorded.get(c, unknown) for c in torques.values()], axis=1)
-    columns |= _payload(rig, len(joints), recorded) | _temperature(recorded)
+    columns |= _payload(rig, len(joints), recorded)
     if not np.isfinite(time_s).all():
         return columns
     order = np.argsort(time_s, kind="stable")
@@ -69,12 +68,13 @@ def _payload(rig: Rig, count: int, recorded: Mapping[str, np.ndarray]) -> dict[s
     return {PAYLOAD: recorded.get(own[0], np.zeros(count))}
 
 
-def _temperature(recorded: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """``temperature_c`` (K,), if it was read at some stops and not at others."""
-    known = np.isfinite(celsius := recorded.get(TEMPERATURE, np.zeros(0)))
+def recorded_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """A recording's own columns (K,) as effects look at them: ``temperature_c`` that was read at
+    some stops only is at the others as it is at these on average."""
+    known = np.isfinite(celsius := columns.get(TEMPERATURE, np.zeros(0)))
     if known.all() or not known.any():
-        return {}
-    return {TEMPERATURE: np.where(known, celsius, celsius[known].mean())}
+        return dict(columns)
+    return {**columns, TEMPERATURE: np.where(known, celsius, celsius[known].mean())}
 
 
 def up_in_root(rig: Rig, recording: RecordedStops) -> np.ndarray:

@@ -29,10 +29,11 @@ LIGHTEST, HEAVIEST = 1.3, 1430.0
 # What the strongest arms for sale carry. No arm carries more than it weighs, either: of those for
 # sale a fifth (KR 1000) to a half (iiwa 14) of that.
 HEAVIEST_LOAD_KG = 2300.0
-# What stands for no number, such as -999, is at a tenth of the stops at most, and ten times as far
-# from the middle of all others as these are apart. Both are choices: 0 for 20 to 24 deg C is not
-# told.
-STAND_INS, BEYOND_REAL = 10, 10.0
+# What stands for no number is at a tenth of the stops at most, and one of these, or a hundred times
+# as far from the middle of all others as these are apart: choices, as a day of work and a night are
+# ten times as far apart as the work is long.
+STAND_INS = (-9999.0, -999.0, -99.0, 99.0, 999.0, 9999.0, 32767.0, -32768.0, 65535.0)
+STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
 FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
@@ -223,14 +224,17 @@ def odd_columns(recording: RecordedStops) -> Iterator[str]:
         known = np.flatnonzero(np.isfinite(column))
         away = np.abs(column[known] - np.median(column[known])) if len(known) else column[known]
         order = known[np.argsort(away, kind="stable")]
-        for count in range(len(known) // STAND_INS, 0, -1):
+        for count in range(len(known) // STOPS_A_STAND_IN, 0, -1):
             near, far = column[order[:-count]], column[order[-count:]]
-            if np.abs(far - np.median(near)).min() > BEYOND_REAL * np.ptp(near) > 0.0:
+            apart = np.abs(far - np.median(near)).min()
+            usual = np.isin(far, STAND_INS).all() and apart > np.ptp(near)
+            if usual or apart > BEYOND_REAL * np.ptp(near) > 0.0:
                 where = listed([recording.stops[i] for i in sorted(order[-count:].tolist())])
-                numbers = " and ".join(f"{each:g}" for each in np.unique(far)[:3])
+                least, most = near.min(), near.max()
+                numbers = listed([f"{each:g}" for each in np.unique(far)])
                 yield (
-                    f"{name} is {numbers} at {where} in stops.csv, and {near.min():g} to "
-                    f"{near.max():g} at all others; leave a cell empty where nothing was measured"
+                    f"{name} is {numbers} at {where} in stops.csv, and {least:g} to {most:g} at "
+                    "all others; leave a cell empty where nothing was measured"
                 )
                 break
 

@@ -170,8 +170,8 @@ def with_formulas_and_names(
 ) -> Stand | None:
     """A run's fit with formulas that stops held out bear out, and the names that stand beside them;
     None where nothing is to be judged beside these, or they come to no optimum."""
-    moved = rejected is not None and rejected.moved
-    if formulas.fall is None or not (found.chance or found.blunders or moved):
+    wrong = rejected is not None and rejected.wrong
+    if formulas.fall is None or not (found.chance or found.blunders or wrong):
         return None
     named = () if formulas.instead else found.found
     names = [s.effect for s in named if s.effect.name not in formulas.needless]

@@ -76,7 +76,7 @@ def _doubtful(run: Run, diagnosis: Mapping[str, Any] | None) -> Iterator[str]:
     elif diagnosis["too_few_stops"]:
         yield "the stops are too few to say whether anything is missing"
     elif diagnosis["verdict"] == "unexplained_structure":
-        yield "there is structure that no known effect explains"
+        yield "there is something that no known effect explains"
     yield from cautions(run)
     for weak in (diagnosis or {}).get("weak_directions", ()):
         if (weak["sigma_mm"] or 0.0) > FAR_OFF * rms["noise_floor"]:

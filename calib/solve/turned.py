@@ -245,10 +245,10 @@ def _free_edge(problem: Problem, scan: ScanStop) -> tuple[str, int] | None:
     path = scan.stops.rig.tree.path(scan.stops.rig.lidar_frame)
     if not path:  # it is the rig's root
         return None
-    for name, moved in scan.stops.edge_bases.items():
-        basis = scan.stops.at_edges(name, moved)
+    for name, own in scan.stops.edge_bases.items():
+        basis = scan.stops.at_edges(name, own[:1])
         turns = np.flatnonzero(np.any(basis[0, path[-1], :3] != 0, axis=0))
-        same = len(basis) == 1 and name in problem.calibration
+        same = len(own) == 1 and name in problem.calibration
         if same and np.array_equal(basis[0, path[-1], :3][:, turns], np.eye(3)):
             return name, int(turns[0])
     return None

@@ -21,8 +21,10 @@ from calib.results.intervals import intervals
 from calib.results.reach import Reach, joint_range, reach
 from calib.results.solution import solution_of
 from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.show import tables
 from calib.solve.fit import solve
+from sensors.stops import POSE
 
 from . import rigs
 
@@ -311,3 +313,19 @@ def test_what_depends_on_a_parameter_by_rounding_alone_does_not_depend_on_it(sou
     columns = np.array([layout.at["arm_link_length"].start, layout.at["arm_joint_offset"].start])
     by_sigma = np.array([[2e-10, 1e-3], [0.0, 0.0]])
     assert layout.moves(by_sigma / layout.sigma[columns], columns).tolist() == [False, True]
+
+
+def test_stops_at_which_nothing_is_measured_do_not_count(tmp_path):
+    """Ten poses, of which the tracker saw three: too few to say anything."""
+    folder = arm_alone(tmp_path / "rec")
+    with (folder / "stops.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))[:10]
+    for row in rows[3:]:
+        row.update({name: "" for name in row if name.rpartition(".")[2] in POSE})
+    with (folder / "stops.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, rows[0].keys())
+        table.writeheader()
+        table.writerows(rows)
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    found = diagnose(run)
+    assert found.too_few and "3 stops are too few" in found.sentences[0]

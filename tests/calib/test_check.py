@@ -387,6 +387,11 @@ def test_numbers_that_stand_for_none():
     assert "lux is -999 at P20, P21" in said and "20.6 to 24 at all others" in said
     (said,) = odd(*usual[:9], np.nan, 9999.0)
     assert "9999 at P10" in said
-    # Neither a tail, nor a few columns of stops, nor what is switched on at one of them.
+    (said,) = odd(*[21.0] * 12, -999.0)
+    assert "-999 at P12" in said and "21 to 21 at all others" in said
+    (said,) = odd(*usual, 1e6)
+    assert "1e+06 at P20" in said
+    # Neither a tail, nor of few stops, nor what is switched on at one of them, nor the next day.
     assert odd(*usual, 30.0) == odd(*usual[:5], -999.0) == odd(*[0.0] * 20, 5.0) == []
-    assert odd(*[np.nan] * 12) == odd() == []
+    assert odd(*[21.0] * 8, *[21.1] * 8, 23.0) == odd(*np.arange(20) * 120.0, 50_000.0) == []
+    assert odd(*np.linspace(-1500, 1500, 20), -999.0) == odd(*[np.nan] * 12) == odd() == []

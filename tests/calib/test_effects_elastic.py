@@ -10,7 +10,7 @@ import calib
 from calib.effects import View, find
 from calib.problem.build import stops_view
 from calib.problem.model import Source
-from calib.rig.columns import stop_columns
+from calib.rig.columns import recorded_columns, stop_columns
 from calib.simulation import load_spec
 from chains.errors import InputError
 
@@ -107,6 +107,15 @@ def test_joints_give_way_to_a_payload_beside_the_tip(source):
         expected[:, j] = -kg * 9.80665 * rise
     np.testing.assert_allclose(found, expected, atol=1e-10)
     assert np.abs(found).max() > 1e-5
+
+
+def test_a_temperature_that_was_not_read_is_that_of_the_other_stops():
+    celsius = np.array([20.0, np.nan, 23.0])
+    found = recorded_columns({"temperature_c": celsius, "humidity": celsius})
+    np.testing.assert_array_equal(found["temperature_c"], [20.0, 21.5, 23.0])
+    np.testing.assert_array_equal(found["humidity"], celsius)
+    unread = recorded_columns({"temperature_c": np.full(3, np.nan)})
+    assert np.isnan(unread["temperature_c"]).all() and not recorded_columns({})
 
 
 def test_each_tip_has_a_payload_of_its_own(tmp_path):

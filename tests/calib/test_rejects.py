@@ -163,15 +163,17 @@ def test_returns_from_anywhere_are_told_where_they_are_many(studied, share, expl
 
 
 @pytest.mark.parametrize(
-    ("share", "coherent", "said"),
+    ("share", "coherent", "short", "sigma_m", "said"),
     [
-        (0.98, True, "is not where it was scanned: its beams read 12.5 ± 0.51 mm long"),
-        (0.98, False, "but at all distances, as they do at glass or a mirror"),
-        (0.065, True, ""),  # of a wall that stands where it was, few beams are rejected
+        (0.98, True, 0.0, 5.1e-4, "where it was scanned: its beams read 12.5 ± 0.51 mm long"),
+        (0.98, True, 0.0, np.nan, "where it was scanned: its beams read 12.5 mm long"),
+        (0.98, False, 0.4, 5.1e-4, "but at all distances, as they do at glass or a mirror"),
+        (0.98, False, 0.95, 5.1e-4, None),  # something stands in the way
+        (0.065, True, 0.0, 5.1e-4, ""),  # of a wall that stands where it was few are rejected
     ],
 )
 def test_a_part_of_the_mesh_is_wrong_where_most_of_its_beams_are(
-    share, coherent, said, monkeypatch
+    share, coherent, short, sigma_m, said, monkeypatch
 ):
     monkeypatch.setattr("calib.blunders.told._at_m", lambda group, sources: None)
     place = Place(
@@ -184,9 +186,9 @@ def test_a_part_of_the_mesh_is_wrong_where_most_of_its_beams_are(
         rejected=0.5 * share,
         beams=0.5,
         residual_m=0.0125,
-        sigma_m=5.1e-4,
+        sigma_m=sigma_m,
         coherent=coherent,
-        short=0.4,
+        short=short,
     )
     found = Rejects(
         share=0.02,
@@ -199,13 +201,12 @@ def test_a_part_of_the_mesh_is_wrong_where_most_of_its_beams_are(
         beyond=False,
         beyond_m=None,
     )
-    assert not found.explained
+    assert found.explained == (said is None)
     blunders, left = found.blunders([]), found.unexplained()
-    assert len(blunders) == bool(said) and len(left) == (not said)
+    assert len(blunders) == bool(said) and len(left) == (said == "")
     for each in blunders:
         assert said in each["sentence"] and each["without"] == "mesh:surface_5"
-        assert (each["size"] is None) == (not coherent)
-        assert (each["sigma"] is None) == (not coherent)
+        assert all((each[key] is None) == (not coherent) for key in ("size", "sigma", "axis"))
 
 
 def test_too_few_stops_or_no_scans_claim_nothing(tmp_path):

@@ -166,14 +166,9 @@ class Rejects:
         return [place for place in self.places if place.structured]
 
     @property
-    def moved(self) -> Sequence[Place]:
-        """Those of them that are surfaces, or parts, which stand elsewhere than the mesh has
-        them: hardly any of their beams is as it should be."""
-        return [place for place in self._wrong if place.coherent]
-
-    @property
-    def _wrong(self) -> Sequence[Place]:
-        """Surfaces of a mesh, or parts, most of whose beams were rejected."""
+    def wrong(self) -> Sequence[Place]:
+        """Those of them that are surfaces of a mesh, or parts, most of whose beams were rejected:
+        they stand elsewhere than the mesh has them, or beams do not end there."""
         mine = (place for place in self.structured if place.covariate in MESH_PARTS)
         return [place for place in mine if self.meshed and place.share > STRUCTURED_SHARE]
 
@@ -186,7 +181,7 @@ class Rejects:
                 (place.residual_m, place.sigma_m) if place.coherent else None,
                 place.p_adjusted,
             )
-            for place in self._wrong
+            for place in self.wrong
             for name in place.names
         ]
 
@@ -223,7 +218,7 @@ class Rejects:
                 "formula": place.formula(),
             }
             for place in self.structured
-            if place not in self._wrong
+            if place not in self.wrong
         ]
 
     def document(self) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
     HELD_OUT_BY_CHANCE,
+    HELD_OUT_UNSAID,
     weighed,
 )
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
@@ -176,9 +177,9 @@ def conclude(
     verdict = BAD if blunders else _verdict(found, answer, more, unsure, calm)
     stands_in = verdict == UNNAMED or formulas.instead
     worn = dressed_up(found, held_out, hold, formulas) if stands_in else [*formulas.needless]
-    deferred = not found.scatter_judged and (verdict == UNNAMED or bool(formulas.formulas))
-    candidates = candidate_documents(heavy, held_out, deferred, worn)
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
+    deferred = not found.scatter_judged and _deferred(verdict, unsure, doubt, formulas)
+    candidates = candidate_documents(heavy, held_out, deferred, worn)
     untestable, said = _untestable(first), unconfirmed(doubt, over) if unsure else ""
     last = [*lasting(found.blunders, first.checked, first.stand.sources)]
     told_of = verdict, heavy, candidates, unexplained, untestable, told_once(last, blunders)
@@ -201,6 +202,13 @@ def conclude(
         rejected=rejected,
         scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
     )
+
+
+def _deferred(verdict: str, unsure: bool, doubt: Candidate | None, formulas: Unnamed) -> bool:
+    """Whether scatter is to be judged once structure is in the model; arguments as in `conclude`,
+    where nobody knows a structure if it is unsure without one in doubt."""
+    unknown = unsure and doubt is None
+    return bool(formulas.formulas) or (verdict == UNNAMED and not unknown)
 
 
 def _blunders(
@@ -261,15 +269,17 @@ def _unconfirmed(found: Search, over: float) -> tuple[bool, Candidate | None]:
     """Whether the held-out error is larger than chance makes it and no structure or effect is
     found, and structure that single beams show: so few stops, or walls, see each part of it that
     they may differ by chance as much. Without any the error has to be larger still. Not where
-    beams scatter by themselves so widely that the error is as expected of them."""
-    there = (
-        found.unnamed or found.found or found.at_first or not found.looks[0].stand.estimate.scans
-    )
-    most = HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE
-    if there or over <= most or over <= most * (alone := found.looks[-1].stand.beams.alone):
+    beams scatter by themselves so widely that the error is as expected of them; nor of an arm
+    alone, or of fewer stops than tests need, of which the limits were not measured."""
+    first, last = found.looks[0], found.looks[-1]
+    there = found.unnamed or found.found or found.at_first
+    if there or not first.stand.estimate.scans or stops_of(first) < FEWEST_STOPS:
         return False, None
-    shown = next(suspects(found.looks[-1].unnamed, ALPHA_UNNAMED), None)
-    return shown is not None or over > HELD_OUT_BESIDE_SCATTER * max(1.0, alone), shown
+    alone = max(1.0, last.stand.beams.alone)
+    if over <= (HELD_OUT_BESIDE_SCATTER if found.chance else HELD_OUT_BY_CHANCE) * alone:
+        return False, None
+    shown = next(suspects(last.unnamed, ALPHA_UNNAMED), None)
+    return shown is not None or over > HELD_OUT_UNSAID * alone, shown
 
 
 def _verdict(found: Search, hold: bool, more: bool, doubt: bool, calm: str) -> str:

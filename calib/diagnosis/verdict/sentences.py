@@ -106,8 +106,8 @@ def unconfirmed(candidate: Candidate | None, over: float) -> str:
     much = f"The held-out error is {over:.1f} times as large as expected, and no test "
     if candidate is None:
         return (
-            f"{much}says why. Something is wrong that neither a known effect nor structure "
-            "describes, or an instrument errs more than rig.yaml says."
+            f"{much}says why. No known effect and no structure in the residuals explains it: "
+            "something else is wrong, or an instrument is noisier than rig.yaml says."
         )
     what = in_words(candidate.effect)
     return (
@@ -136,8 +136,8 @@ def _first_sentences(verdict: str, look: Look, beside: bool) -> list[str]:
     scans = len(look.stand.estimate.scans)
     if 0 < scans < FEWEST_STOPS:
         out.append(
-            f"No effect of the LiDAR could be told: scans of {scans} stop{'s' * (scans > 1)} are "
-            f"too few, and {FEWEST_STOPS} are the least."
+            f"That says nothing of the LiDAR: scans of {scans} stop{'s' * (scans > 1)} are too few "
+            f"to name an effect of it, and {FEWEST_STOPS} are the least."
         )
     described = [effect.name for effect in look.stand.model.effects if effect.seen]
     if described:
@@ -231,7 +231,8 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
     if step.effect.twin:
         out.append(f"Nothing that was measured tells it from {step.effect.twin}.")
     out += [
-        f"At these stops {other} goes with {name}, so nothing tells which of the two it follows."
+        f"At these stops {other} goes with {name}, so nothing tells which of the "
+        "two the error follows."
         for name, other in columns_alike(step)
     ]
     out += [
@@ -258,5 +259,5 @@ def _residual(look: Look) -> str:
 
 
 def stops_of(look: Look) -> int:
-    """How many stops there are."""
-    return int(look.linear.stop.max()) + 1
+    """How many stops were measured."""
+    return look.linear.whole.layout.measured

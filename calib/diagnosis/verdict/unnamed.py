@@ -198,14 +198,14 @@ def _thrown(before: Errors, after: Errors) -> tuple[float, float]:
 
 
 def _better(before: Errors, named: Errors, after: Errors) -> bool:
-    """Whether unseen stops are predicted better after formulas took the place of names, by as much
-    as matters, than with these or before them, and no more beams are rejected; or far fewer are,
-    and these fit."""
+    """Whether formulas predict unseen stops better than names did, and than neither, by as much as
+    matters, and no more beams are rejected than with the names; or far fewer are, and these fit."""
     now, then = _thrown(named, after)
+    best = min(named.size.judged_mm, before.size.judged_mm)
     if now - then > TAKEN_BACK:
-        return _by_chance(after) or after.size.judged_mm <= named.size.judged_mm
+        return _by_chance(after) or after.size.judged_mm <= best
     least = FALL_MATTERS * before.size.judged_mm
-    falls = after.size.judged_mm < min(named.size.judged_mm, before.size.judged_mm) - least
+    falls = after.size.judged_mm < best - least
     return falls and then - now <= TAKEN_BACK
 
 

@@ -273,6 +273,7 @@ def test_names_that_it_may_replace_are_asked_for_beside_a_formula(
         ((3.0, 0.004), (2.4, 0.004), True),
         ((2.41, 0.004), (2.4, 0.004), False),
         ((5.0, 0.004), (4.1, 0.004), False),
+        ((5.0, 0.05), (4.1, 0.004), False),
     ],
     ids=[
         "worse, of more",
@@ -282,6 +283,7 @@ def test_names_that_it_may_replace_are_asked_for_beside_a_formula(
         "of as many",
         "no better",
         "than bad names",
+        "than bad names, of more",
     ],
 )
 def test_errors_are_compared_by_how_many_beams_they_are_of(named, after, better):
