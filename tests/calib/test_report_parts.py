@@ -101,7 +101,7 @@ def apart(part, what):
     [
         ({}, found(), "green", "as well as noise allows"),
         ({}, None, "amber", "not diagnosed"),
-        ({}, found("unexplained_structure"), "amber", "structure"),
+        ({}, found("unexplained_structure"), "amber", "something that no known"),
         ({}, found(sigma_mm=3.5), "amber", "a.x may still be off by 3.5 mm"),
         (rms(1.5), found(), "amber", "1.5 times as large as expected"),
         (rms(None), found(), "amber", "no stops were held out"),
