@@ -11,8 +11,6 @@ from calib.effects import CATALOGUE, Effect, Site
 from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
 
-FINER = 9  # shapes tried between the two beside the best one of a grid
-
 
 def known_effects(
     model: Model,
@@ -71,7 +69,7 @@ def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
     """An effect in finer shapes between those of a grid beside its own, which is one of them."""
     i = grid.index(effect.shape)
     ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
+    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, effect.finer)
     spaced = np.rint(spaced) if effect.whole else spaced
     shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
     return [effect.at(shape) for shape in sorted(shapes)]

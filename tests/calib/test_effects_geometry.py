@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
+from calib.diagnosis.candidates import finer
 from calib.effects import View, find
 from calib.problem.model import Source
 from calib.rig import load_rig
@@ -315,6 +316,8 @@ def test_the_mesh_is_moved_beyond_a_seam_alone(source, name):
     np.testing.assert_allclose(grid, low + (high - low) * np.array([0.25, 0.5, 0.75]))
     near = np.array(find(name).at(grid[0]).beside(stops))
     assert (near < grid[0]).any() and (near > grid[0]).any() and (near > low).all()
+    fine = [one.shape for one in finer(find(name).at(grid[1]), grid.tolist())]
+    assert np.diff(fine).max() < 0.01 * (high - low) and grid[1] in fine
     assert not effect.shapes(View(source.rig, 1, {}, np.zeros((1, 6))))
 
 

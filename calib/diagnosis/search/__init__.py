@@ -159,8 +159,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
         alike = [*near, *(c for c in others if c.effect.name not in tested)]
-        named = {step.effect.family for step in found}
-        effects = [e for e in as_much if e.family not in named]
+        effects = [e for e in as_much if e.family not in {s.effect.family for s in found}]
         rivals = dict.fromkeys(e.name for e in (*(c.effect for c in alike), *effects))
         chance[-1] = replace(strongest, rivals=tuple(rivals))
     last = looks[-1]
@@ -367,6 +366,8 @@ def _fitted(
     confirmed what it explains, at that of the other (`sure`)."""
     near, finest = look.closely(candidate, progress)
     test, p = judged(near, finest, progress)
+    if p >= ALPHA_EFFECT and finest.effect.jumps:  # which few rows show where it jumps
+        p = min(p, 2.0 * judged(look, candidate, progress)[1])
     p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
     if p >= ALPHA_EFFECT:
         return []
