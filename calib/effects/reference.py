@@ -86,7 +86,7 @@ class MeshSeamX(MeshShift):
     axis = 0  # across which seams run
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return RIGID if rig.reference else ()  # whatever tells where the mesh is as a whole
+        return RIGID if rig.reference else ()  # the mesh tells of it by itself, without targets
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return self._seams(stops, np.arange(1, SEAMS + 1) / (SEAMS + 1))
@@ -100,7 +100,7 @@ class MeshSeamX(MeshShift):
         return super().basis(view) * beyond[:, None, None]
 
     def _seams(self, stops: View, shares: np.ndarray, of: float | None = None) -> tuple[float, ...]:
-        """Seams inside the mesh at some shares of its length beyond one of them, or its end."""
+        """Seams inside the mesh, at some shares of its length from a seam or from its lower end."""
         if "mesh_box_m" not in stops.columns or not self.params(stops.rig):
             return ()
         low, high = stops["mesh_box_m"][0, :, self.axis]

@@ -30,8 +30,8 @@ LIGHTEST, HEAVIEST = 1.3, 1430.0
 # sale a fifth (KR 1000) to a half (iiwa 14) of that.
 HEAVIEST_LOAD_KG = 2300.0
 # What stands for no number is at a tenth of the stops at most, and one of these, or a hundred times
-# as far from the middle of all others as these are apart: choices, as a day of work and a night are
-# ten times as far apart as the work is long.
+# as far from the middle of all others as these are apart. Choices: a column of times that goes on
+# the next morning is not told, as that is some ten times as far as the first day was long.
 STAND_INS = (-9999.0, -999.0, -99.0, 99.0, 999.0, 9999.0, 32767.0, -32768.0, 65535.0)
 STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known

@@ -31,7 +31,7 @@ def columns_alike(step: NamedEffect) -> Iterator[tuple[str, str]]:
 
 def _columns(sources: Sequence[Source]) -> dict[str, np.ndarray]:
     """Numbers that every recording has of each of its stops, (K,) over all of these, and that
-    differ. What an effect wants of ``time_s`` is the order of its stops."""
+    differ. Not ``time_s``: effects look at it for the order of the stops alone."""
     first, *others = sources
     names = [n for n in (*first.recording.covariates, SINCE) if np.ndim(first.columns.get(n)) == 1]
     names = [n for n in names if all(np.ndim(s.columns.get(n)) == 1 for s in others)]
