@@ -124,7 +124,8 @@ class Stops:
         joints: (K, J) reported joints, rad or m.
         edge_bases: variable -> (K or 1, e, 6, P), the twists of the edges that it moves, per unit.
         edges: variable -> (e,) which of the E edges these are.
-        joint_bases: variable -> (K or 1, J, P), the joint error per unit.
+        joint_bases: variable -> (K or 1, j, P), the errors of the joints that it changes, per unit.
+        axes: variable -> (j,) which of the J joints these are.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
         noise: variable of the joint errors (J,) of these stops alone, or None.
@@ -135,6 +136,7 @@ class Stops:
     edge_bases: Mapping[str, np.ndarray]
     edges: Mapping[str, np.ndarray]
     joint_bases: Mapping[str, np.ndarray]
+    axes: Mapping[str, np.ndarray]
     root: str
     reference: str | None
     noise: str | None = None
@@ -174,6 +176,7 @@ class Stops:
             edge_bases=stacked([s.edge_bases for s in stops], counts),
             edges=first.edges,
             joint_bases=stacked([s.joint_bases for s in stops], counts),
+            axes=first.axes,
             root=ROOT,
             reference=first.reference,
             noise=None if first.noise is None else NOISE,
@@ -192,8 +195,10 @@ class Stops:
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
         if self.noise is not None:
             joints = joints + values[self.noise]
+        if self.joint_bases:
+            joints = joints.copy()
         for name, basis in self.joint_bases.items():
-            joints = joints + np.matvec(basis, values[name])
+            joints[:, self.axes[name]] += np.matvec(basis, values[name])
         for name, basis in self.edge_bases.items():
             twists = twists + self.at_edges(name, basis @ values[name])
         if not derivatives:
@@ -205,7 +210,7 @@ class Stops:
             for name, basis in self.edge_bases.items()
         }
         for name, basis in self.joint_bases.items():
-            d[name] = d.get(name, 0.0) + placed.d_joint @ basis
+            d[name] = d.get(name, 0.0) + placed.d_joint[:, :, self.axes[name]] @ basis
         if self.noise is not None:
             d[self.noise] = placed.d_joint
         return Placed(placed.Ts_root_frame, d)
@@ -280,13 +285,17 @@ def place(
         }
         for site in (Site.EDGE, Site.JOINTS)
     }
-    moved = {n: np.flatnonzero(b.any(axis=(0, 2, 3))) for n, b in at[Site.EDGE].items()}
+    moved, axes = (
+        {n: np.flatnonzero(np.any(b, axis=(0, *range(2, b.ndim)))) for n, b in bases.items()}
+        for bases in at.values()
+    )
     return Stops(
         rig=rig,
         joints=joints,
         edge_bases={n: basis[:, moved[n]] for n, basis in at[Site.EDGE].items()},
         edges=moved,
-        joint_bases=at[Site.JOINTS],
+        joint_bases={n: basis[:, axes[n]] for n, basis in at[Site.JOINTS].items()},
+        axes=axes,
         root=root,
         reference=reference,
     )

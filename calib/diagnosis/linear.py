@@ -46,18 +46,18 @@ NONE = np.zeros(0, int)  # the stops, or places, of no clusters
 class Linear:
     """Normal equations of S unknowns about a solution, and their right side by clusters of rows.
 
-    What belongs to stops and surfaces is eliminated from the equations, but not from the gradients:
-    these are over all U unknowns, and made of residuals as large as errors are (`leverage`).
+    What belongs to stops and surfaces is eliminated from the equations, and expressed by the S in
+    the gradients. These are made of residuals as large as errors are (`leverage`).
 
     Args:
         candidates: unknowns that the model does not have; they have no prior.
         owner: unknown -> whose it is.
         at: unknown -> its columns among the S, of those that were not eliminated.
-        columns: unknown -> its columns among the U.
+        columns: unknown -> its columns among all U.
         information: (S, S) of all rows; the priors of the hardware widened.
         raw: (S, S) the same before anything was eliminated.
-        gradient: (C, U) sparse, of each cluster of rows.
-        score: (U,) the whole gradient, of residuals as they are.
+        gradient: (C, S) of each cluster of rows.
+        score: (S,) the whole gradient, of residuals as they are.
         others: all rows but those of beams, of residuals as large as errors are.
         stop: (C,) which stop the rows of a cluster belong to, -1 for none.
         place: (C,) which part of the room they look at, -1 for none.
@@ -75,7 +75,7 @@ class Linear:
     columns: Mapping[str, slice]
     information: np.ndarray
     raw: np.ndarray | None
-    gradient: csr_array
+    gradient: np.ndarray
     score: np.ndarray
     others: Sequence[ClusteredRows | OwnRows]
     stop: np.ndarray
@@ -189,6 +189,7 @@ def linearise_with(
         each /= layout.sigma[layout.kept]
         each /= layout.sigma[layout.kept, None]
     table, stop, place = gradients.table()
+    whole = csr_array(table.sum(axis=0)[None] - more)
     return Linear(
         candidates=tuple(candidates),
         owner={name: unknown.owner for name, unknown in wide.variables.items()},
@@ -196,9 +197,9 @@ def linearise_with(
         columns=layout.at,
         information=information,
         raw=raw,
-        gradient=table,
+        gradient=linear.reduced(table),
         others=grown,
-        score=np.asarray(table.sum(axis=0)).ravel() - more,
+        score=linear.reduced(whole)[0],
         stop=stop,
         place=place,
         places=gradients.places,

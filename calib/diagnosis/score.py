@@ -15,13 +15,12 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array, vstack
 
 from calib.blunders.chance import at_least, enough, log_tail
 from calib.diagnosis.jackknife import ScoreSpread, by_signs
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import NONE, Linear
-from calib.linear.clusters import add_product, summed
+from calib.linear.clusters import summed
 from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
@@ -119,7 +118,11 @@ def projection(linear: Linear, names: Sequence[str]) -> tuple[np.ndarray, np.nda
 def away_from_model(linear: Linear, names: Sequence[str]) -> np.ndarray:
     """Directions (U, Q) of variables with all that the model absorbs of them taken off, stops'
     poses and surfaces' errors included."""
-    return linear.whole.away(*projection(linear, names))
+    theirs, model, taken = projection(linear, names)
+    kept = np.zeros((len(linear.information), len(theirs)))
+    kept[theirs, np.arange(len(theirs))] = 1.0
+    kept[model] = -taken
+    return linear.whole.followed(kept)
 
 
 def information_left(linear: Linear, names: Sequence[str]) -> np.ndarray:
@@ -144,38 +147,18 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         size = len(linear.at[name])
         at[name], start = slice(start, start + size), start + size
     theirs, model, taken = projection(linear, names)
-    shares = _shares(linear, names, linear.whole.away(theirs, model, taken))
     return Scores(
         at=at,
         owner={name: linear.owner[name] for name in names},
-        score=shares[-1].copy(),  # or the clusters would be kept with it
+        score=linear.score[theirs] - linear.score[model] @ taken,
         information=_left(linear, theirs, model, taken),
         whole=linear.raw[np.ix_(theirs, theirs)],
-        cells=shares[:-1],
+        cells=linear.gradient[:, theirs] - linear.gradient[:, model] @ taken,
         stop=linear.stop,
         place=linear.place,
         weight_m2=linear.weight_m2,
         spent=spent,
     )
-
-
-def _shares(linear: Linear, names: Sequence[str], away: np.ndarray) -> np.ndarray:
-    """Shares (C + 1, Q) of the score along directions (U, Q), of clusters and, last, of all rows as
-    they are. Clusters of one stop depend on the same unknowns of that stop, those of one surface on
-    the same parts of it: so they are taken in the order of stops, and of places."""
-    every = csr_array(vstack([linear.gradient, csr_array(linear.score[None])]))
-    theirs = np.concatenate([np.r_[linear.columns[name]] for name in names])
-    out = every[:, theirs].toarray()  # along these directions it is these that move, by 1
-    layout, rest = linear.whole.layout, away.any(axis=1)
-    parts = np.zeros(len(rest), bool)
-    parts[np.append(layout.finest, layout.cells)] = True
-    rest[theirs] = rest[parts] = False
-    for some, number in ((rest, linear.stop), (parts, linear.place)):
-        only = every.copy()
-        only.data *= some[only.indices]
-        only.eliminate_zeros()
-        add_product(out, only, away, np.argsort(np.append(number, -1), kind="stable"))
-    return out
 
 
 @dataclass(frozen=True)

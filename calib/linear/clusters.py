@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-CLUSTERS_AT_ONCE = 64  # in one dense product: about those of a stop with a LiDAR
-
 
 def summed(values: np.ndarray, at: np.ndarray, count: int | None = None) -> np.ndarray:
     """Sums (G, P) of values (N, P) by group (N,), numbered from 0; -1 for none. There are as many
@@ -54,16 +52,6 @@ def over_all(some: Sequence[Entries], size: int) -> csr_array:
         return csr_array((0, size))
     values, columns, count = map(np.concatenate, zip(*some, strict=True))
     return csr_array((values, columns, np.append(0, np.cumsum(count))), shape=(len(count), size))
-
-
-def add_product(out: np.ndarray, rows: csr_array, by: np.ndarray, order: np.ndarray) -> None:
-    """Add ``rows @ by`` (n, q), of sparse rows (n, U). Rows that follow each other in an `order`
-    (n,) share few columns: blocks of them are multiplied as dense matrices over these."""
-    for some in np.split(order, range(CLUSTERS_AT_ONCE, len(order), CLUSTERS_AT_ONCE)):
-        here = rows[some]
-        touched, at = np.unique(here.indices, return_inverse=True)
-        shape = len(some), len(touched)
-        out[some] += csr_array((here.data, at, here.indptr), shape=shape).toarray() @ by[touched]
 
 
 class ClusteredRows(NamedTuple):

@@ -78,22 +78,15 @@ class Linearisation:
             scans={stop: sums.onto(to) for stop, sums in self.scans.items()},
         )
 
-    def directions(self, kept: np.ndarray, alone: np.ndarray | None = None) -> np.ndarray:
+    def directions(self, kept: np.ndarray) -> np.ndarray:
         """All unknowns (U, q) that follow from those kept (S + 1, q), in units of their sigmas.
 
         The last row of `kept` is what the right side is multiplied by: -1 for a solution, 0 for a
         direction, of which the right side is no part.
-
-        Args:
-            alone: (q,) of each direction the position, among the kept, of an unknown that moves by
-                1 in it and in no other direction; its row of `kept` is 0. None where there are no
-                such unknowns.
         """
         layout = self.layout
         out = np.zeros((layout.size + 1, kept.shape[1]))
         out[layout.kept], out[-1] = kept[:-1], kept[-1]
-        alone = layout.kept[np.zeros(0, int) if alone is None else alone]
-        one = positions(layout.size + 1, alone)
         for some in self._batches():
             over = np.unique(np.concatenate([each.over for each in some]))
             at = positions(layout.size + 1, over)
@@ -101,11 +94,7 @@ class Linearisation:
             for each in some:
                 gain[first : first + len(each.columns), at[each.over]] = each.gain
                 first += len(each.columns)
-            apart = one[over] >= 0
-            moved = gain[:, ~apart] @ out[over[~apart]]
-            moved[:, one[over[apart]]] += gain[:, apart]
-            out[np.concatenate([each.columns for each in some])] = -moved
-        out[alone, np.arange(len(alone))] = 1.0
+            out[np.concatenate([each.columns for each in some])] = -(gain @ out[over])
         return out[:-1]
 
     def _batches(self) -> Iterator[list[Eliminated]]:
@@ -128,23 +117,28 @@ class Linearisation:
         scaled = np.vstack([kept / sigma[self.layout.kept, None], np.zeros((1, kept.shape[1]))])
         return self.directions(scaled) * sigma[:, None]
 
-    def away(self, one: np.ndarray, others: np.ndarray, taken: np.ndarray) -> np.ndarray:
-        """Directions in all unknowns (U, q), in the unknowns' own units: in each, one of the kept
-        (q,) moves by 1, others of the kept (m,) by minus what is taken off (m, q), and what was
-        eliminated follows."""
-        sigma, unit = self.layout.sigma, self.layout.sigma[self.layout.kept]
-        kept = np.zeros((len(unit) + 1, len(one)))
-        kept[others] = -taken / unit[others, None] * unit[one]
-        out = self.directions(kept, one)
-        out *= sigma[:, None]
-        out /= unit[one]
-        return out
-
     def step(self, kept: np.ndarray) -> dict[str, np.ndarray]:
         """Tangent step of each eliminated unknown, given that of the kept (S,) in their units."""
         scaled = np.append(kept / self.layout.sigma[self.layout.kept], -1.0)
         moved = self.directions(scaled[:, None])[:, 0] * self.layout.sigma
         return {name: moved[self.layout.at[name]] for name in self.layout.inner()}
+
+    def reduced(self, rows: csr_array) -> np.ndarray:
+        """Rows (n, U) over all unknowns, in these' own units, as rows over the kept (n, S) that
+        say the same of each state in which what was eliminated follows the kept."""
+        found = np.empty((rows.shape[0], len(self.layout.kept)))
+        first = np.full(len(found), len(self.eliminated))
+        gone, row = (
+            self._gone_in[rows.indices],
+            np.repeat(np.arange(len(found)), np.diff(rows.indptr)),
+        )
+        np.minimum.at(first, row[gone >= 0], gone[gone >= 0])
+        order = np.argsort(first, kind="stable")  # those of one stop together
+        for some in np.array_split(order, range(ROWS_AT_ONCE, len(order), ROWS_AT_ONCE)):
+            for each, _, mine in self._through(rows[some]):
+                if each is None:
+                    found[some] = mine
+        return found
 
     def covariance(self, rows: csr_array, kept: np.ndarray) -> np.ndarray:
         """Covariance (q, q) of ``rows @ unknowns``.
@@ -164,6 +158,15 @@ class Linearisation:
         """What each step of the elimination, and the kept, add to a covariance of rows: of which
         rows (n,), these over some unknowns (n, e), and the unknowns' covariance with them (e, n);
         arguments as of `covariance`."""
+        for each, some, mine in self._through(rows):
+            yield some, mine, kept @ mine.T if each is None else each.solve(mine.T)
+
+    def _through(
+        self, rows: csr_array
+    ) -> Iterator[tuple[Eliminated | None, np.ndarray, np.ndarray]]:
+        """Rows (n, U) through the elimination: for each step of it that they touch, which of them
+        do (m,), and these (m, e) over its unknowns, in units of sigmas. Last, for no step, all rows
+        over the kept (n, S), in the unknowns' own units."""
         sigma, last = self.layout.sigma, self.layout.kept
         touched = np.unique(rows.indices)
         concerned = self._concerned(touched)
@@ -179,10 +182,9 @@ class Linearisation:
             if not len(some):
                 continue
             mine = mine[some]
-            yield some, mine, each.solve(mine.T)
+            yield each, some, mine
             left[np.ix_(some, at[each.over])] -= mine @ each.gain
-        mine = left[:, at[last]] / sigma[last]
-        yield np.arange(len(left)), mine, kept @ mine.T
+        yield None, np.arange(len(left)), left[:, at[last]] / sigma[last]
 
     @cached_property
     def _gone_in(self) -> np.ndarray:

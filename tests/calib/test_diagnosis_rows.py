@@ -50,9 +50,10 @@ def linear(stand):
 def every_row(stand, linear):
     """All rows, one by one, along every unknown."""
     wide = problem_with(stand, ADDED)
-    away = np.eye(linear.gradient.shape[1])
+    away = np.eye(linear.whole.layout.size)
     found = list(rows_along(linear, wide, stand.estimate, away, lambda done, total: None))
-    return np.vstack([rows.A for rows in found]), np.concatenate([rows.b for rows in found])
+    at = np.stack([np.concatenate([getattr(r, k) for r in found]) for k in ("stop", "place")])
+    return np.vstack([rows.A for rows in found]), np.concatenate([rows.b for rows in found]), at
 
 
 def sizes(A):
@@ -70,7 +71,7 @@ def test_places_are_numbered_in_the_order_of_stops_however_many_threads(stand, l
 
     monkeypatch.setattr(StopRows, "places", places)
     wide, nothing = problem_with(stand, ()), lambda done, total: None
-    along = stand.estimate, np.zeros((linear.gradient.shape[1], 1)), nothing
+    along = stand.estimate, np.zeros((linear.whole.layout.size, 1)), nothing
 
     def found(count):
         with workers(count):
@@ -108,22 +109,37 @@ def test_without_its_candidates_a_linearisation_is_that_of_the_fit(stand):
         np.testing.assert_allclose(*whole, rtol=1e-9, atol=1e-9 * np.abs(whole).max())
 
 
-def test_gradients_by_cluster_add_up_to_that_of_all_rows(linear, every_row):
-    A, b = every_row
-    total = np.asarray(linear.gradient.sum(axis=0)).ravel()
+def test_gradients_of_clusters_are_those_of_their_rows_with_the_others_eliminated(
+    linear, every_row
+):
+    A, b, at = every_row
+    scale, (kept, gone, back) = sizes(A), eliminated(linear, A)
+    left = (A[:, kept] / scale[kept] - A[:, gone] / scale[gone] @ back) * b[:, None]
+    clusters, number = np.unique([linear.stop, linear.place], axis=1, return_inverse=True)
+    places = {pair: i for i, pair in enumerate(map(tuple, clusters.T))}
+    expected = np.zeros((len(places), len(kept)))
+    np.add.at(expected, [places[pair] for pair in map(tuple, at.T)], left)
+    found = np.zeros_like(expected)
+    np.add.at(found, number, linear.gradient[:, linear.among(list(linear.at))] / scale[kept])
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def eliminated(linear, A):
+    """Of rows over all unknowns, which columns are kept and which are not, and what these are by
+    those, all in units of what the rows tell of each."""
+    kept = np.concatenate([np.r_[linear.columns[name]] for name in linear.at])
     scale = sizes(A)
-    np.testing.assert_allclose(total / scale, A.T @ b / scale, atol=1e-8)
+    unit = (A / scale).T @ (A / scale)
+    gone = np.setdiff1d(np.arange(len(unit)), kept)
+    return kept, gone, np.linalg.solve(unit[np.ix_(gone, gone)], unit[np.ix_(gone, kept)])
 
 
 def test_the_equations_are_those_of_all_rows_with_the_others_eliminated(linear, every_row):
     """Raw, the plain sum; then the Schur complement on what is kept; and the way back."""
-    A, _ = every_row
-    kept = np.concatenate([np.r_[linear.columns[name]] for name in linear.at])
-    order = linear.among(list(linear.at))
-    scale = sizes(A)
+    A, _, _ = every_row
+    kept, gone, back = eliminated(linear, A)
+    order, scale = linear.among(list(linear.at)), sizes(A)
     unit = (A / scale).T @ (A / scale)
-    gone = np.setdiff1d(np.arange(len(unit)), kept)
-    back = np.linalg.solve(unit[np.ix_(gone, gone)], unit[np.ix_(gone, kept)])
     schur = unit[np.ix_(kept, kept)] - unit[np.ix_(kept, gone)] @ back
     square, both = np.ix_(order, order), np.outer(scale[kept], scale[kept])
     np.testing.assert_allclose(linear.raw[square] / both, unit[np.ix_(kept, kept)], atol=1e-9)
@@ -134,8 +150,8 @@ def test_the_equations_are_those_of_all_rows_with_the_others_eliminated(linear, 
 
 
 def test_the_fit_is_where_its_own_gradient_vanishes(linear, every_row):
-    total = np.asarray(linear.gradient.sum(axis=0)).ravel()
-    scale = sizes(every_row[0])
+    A, b, _ = every_row
+    total, scale = A.T @ b, sizes(A)
     for name, at in linear.columns.items():
         # In sigmas of independent rows; priors from paper are left out here, all others are in.
         if name.startswith(("root@", "joints@", "0/reference")):
@@ -152,7 +168,7 @@ def test_what_an_effect_would_explain_is_what_a_refit_finds(stand, linear):
     assert abs(one.estimate()[0]) == pytest.approx(0.4 * 0.003, rel=0.3)
 
 
-def test_gradients_are_derivatives_of_the_cost(stand, linear):
+def test_rows_are_derivatives_of_the_cost(stand, linear, every_row):
     """By finite differences of the whitened rows of one stop, weights held."""
     scan, association = stand.estimate.scans[0], stand.estimate.associations[0]
     effect = effects.find("incidence_angle_bias")
@@ -167,8 +183,9 @@ def test_gradients_are_derivatives_of_the_cost(stand, linear):
     weight = at.weight / np.square(at.sigma_m)
     expected = -np.sum(weight * change * at.residual_m)
     column = linear.columns[term.variable].start
-    cells = (linear.stop == 0) & (linear.place >= 0)
-    found = linear.gradient[cells][:, [column]].sum()
+    A, b, (stop, place) = every_row
+    beams = (stop == 0) & (place >= 0)
+    found = A[beams, column] @ b[beams]
     assert found == pytest.approx(expected, rel=1e-5)
 
 
