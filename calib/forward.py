@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from chains.errors import NoColumnError
 Values = Mapping[str, np.ndarray]
 # Names of stops' own unknowns where several stops are taken together: a value for each stop.
 ROOT, NOISE = "root of each", "noise of each"
-Derivatives = dict[str, np.ndarray]
+Derivatives = Mapping[str, np.ndarray]
 
 
 def named(name: str, rig: str) -> str:
@@ -57,6 +59,79 @@ class Term:
         column = np.full(basis.size + 1, -1)  # the last stands for index -1: none
         column[self.free] = np.arange(len(self.free))
         return OneHot(column[basis.index], basis.values, len(self.free))
+
+
+class Part(NamedTuple):
+    """What a variable moves at a site: which of the site's components (c,), and the basis
+    (K or 1, c, n) by which it does."""
+
+    site: Site
+    components: np.ndarray
+    basis: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BySite(Mapping[str, np.ndarray]):
+    """Derivatives (K, m, n) of what is at K stops by each variable: of the many that act at a few
+    sites, the derivative by site times the basis, multiplied out when asked.
+
+    Args:
+        sites: site -> (K, m, C) derivative by its components.
+        parts: variable -> what it moves there.
+        direct: variable -> (K, m, n), of all others.
+    """
+
+    sites: Mapping[Site, np.ndarray]
+    parts: Mapping[str, Sequence[Part]]
+    direct: Mapping[str, np.ndarray]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name in self.direct:
+            return self.direct[name]
+        return sum(self.sites[p.site][:, :, p.components] @ p.basis for p in self.parts[name])
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.parts or name in self.direct
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.parts
+        yield from self.direct
+
+    def __len__(self) -> int:
+        return len(self.parts) + len(self.direct)
+
+    def then(self, outer: np.ndarray) -> BySite:
+        """Those of what depends on this by a derivative (K, m', m)."""
+        sites, direct = (
+            {name: outer @ d for name, d in some.items()} for some in (self.sites, self.direct)
+        )
+        return replace(self, sites=sites, direct=direct)
+
+    def beside(self, direct: Derivatives) -> BySite:
+        """Those by more variables (K, m, n) too."""
+        return replace(self, direct={**self.direct, **direct})
+
+    def at_site(self, site: Site, d: np.ndarray, bases: Mapping[str, np.ndarray]) -> BySite:
+        """Those by variables that move all components of one more site, by bases (K or 1, C, n);
+        its derivative is d (K, m, C)."""
+        every = np.arange(d.shape[2])
+        parts = {name: [Part(site, every, basis)] for name, basis in bases.items()}
+        return replace(self, sites={**self.sites, site: d}, parts={**self.parts, **parts})
+
+    def table(self, names: Iterable[str]) -> tuple[np.ndarray, dict[str, slice]]:
+        """All derivatives (K, m, N) by some variables, and which columns are whose."""
+        names = list(names)
+        ends = np.cumsum([0, *(self._width(name) for name in names)]).tolist()
+        at = {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=True)}
+        first = next(iter(self.sites.values()))
+        out = np.empty((*first.shape[:2], ends[-1]))
+        for name, columns in at.items():
+            out[:, :, columns] = self[name]
+        return out, at
+
+    def _width(self, name: str) -> int:
+        of = self.direct[name] if name in self.direct else self.parts[name][0].basis
+        return of.shape[-1]
 
 
 @dataclass(frozen=True)
@@ -195,25 +270,23 @@ class Stops:
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
         if self.noise is not None:
             joints = joints + values[self.noise]
+        parts: dict[str, list[Part]] = {}
+        for name, basis in self.edge_bases.items():
+            twists = twists + self.at_edges(name, basis @ values[name])
+            components = (6 * self.edges[name][:, None] + np.arange(6)).ravel()
+            parts[name] = [Part(Site.EDGE, components, _flat(basis))]
         if self.joint_bases:
             joints = joints.copy()
         for name, basis in self.joint_bases.items():
             joints[:, self.axes[name]] += np.matvec(basis, values[name])
-        for name, basis in self.edge_bases.items():
-            twists = twists + self.at_edges(name, basis @ values[name])
+            parts.setdefault(name, []).append(Part(Site.JOINTS, self.axes[name], basis))
         if not derivatives:
             return Placed(self.rig.tree.transform(frame, joints, twists), {})
         placed = self.rig.tree.place(frame, joints, twists)
-        count = len(joints)
-        d = {
-            name: placed.d_twist[:, :, self.edges[name]].reshape(count, 6, -1) @ _flat(basis)
-            for name, basis in self.edge_bases.items()
-        }
-        for name, basis in self.joint_bases.items():
-            d[name] = d.get(name, 0.0) + placed.d_joint[:, :, self.axes[name]] @ basis
-        if self.noise is not None:
-            d[self.noise] = placed.d_joint
-        return Placed(placed.Ts_root_frame, d)
+        by_edge = placed.d_twist.reshape(len(joints), 6, -1)
+        sites = {Site.EDGE: by_edge, Site.JOINTS: placed.d_joint}
+        own = {} if self.noise is None else {self.noise: placed.d_joint}
+        return Placed(placed.Ts_root_frame, BySite(sites, parts, own))
 
     def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_world_frame = T_world_root @ T_root_frame."""
@@ -221,7 +294,7 @@ class Stops:
         T = values[self.root] @ inner.T
         if not derivatives:
             return Placed(T, {})
-        return Placed(T, inner.d | {self.root: se3.adjoint(se3.inverse(inner.T))})
+        return Placed(T, inner.d.beside({self.root: se3.adjoint(se3.inverse(inner.T))}))
 
     def in_reference(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_reference_frame = inverse(T_world_reference) @ T_world_frame."""
@@ -231,7 +304,7 @@ class Stops:
         T = se3.inverse(values[self.reference]) @ outer.T
         if not derivatives:
             return Placed(T, {})
-        return Placed(T, outer.d | {self.reference: -se3.adjoint(se3.inverse(T))})
+        return Placed(T, outer.d.beside({self.reference: -se3.adjoint(se3.inverse(T))}))
 
 
 def place_each(stops: Sequence[Stops], frame: str, values: Values) -> Iterator[Placed]:
@@ -277,25 +350,19 @@ def place(
         reference: variable of T_world_reference, or None.
     """
     view = View(rig, len(joints), columns, joints)
-    at = {
-        site: {
-            t.variable: t.basis(view)
-            for t in terms
-            if t.effect.site is site and not t.effect.widens
-        }
-        for site in (Site.EDGE, Site.JOINTS)
-    }
-    moved, axes = (
-        {n: np.flatnonzero(np.any(b, axis=(0, *range(2, b.ndim)))) for n, b in bases.items()}
-        for bases in at.values()
-    )
+    edges, axes = ({}, {}), ({}, {})
+    for site, (bases, which) in zip((Site.EDGE, Site.JOINTS), (edges, axes), strict=True):
+        for t in (t for t in terms if t.effect.site is site and not t.effect.widens):
+            basis = t.basis(view)
+            which[t.variable] = moved = np.flatnonzero(basis.any(axis=(0, *range(2, basis.ndim))))
+            bases[t.variable] = basis if len(moved) == basis.shape[1] else basis[:, moved]
     return Stops(
         rig=rig,
         joints=joints,
-        edge_bases={n: basis[:, moved[n]] for n, basis in at[Site.EDGE].items()},
-        edges=moved,
-        joint_bases={n: basis[:, axes[n]] for n, basis in at[Site.JOINTS].items()},
-        axes=axes,
+        edge_bases=edges[0],
+        edges=edges[1],
+        joint_bases=axes[0],
+        axes=axes[1],
         root=root,
         reference=reference,
     )

@@ -332,11 +332,11 @@ class _JointSums:
     def of_body(cls, block: SeenBody, whole: Linearisation) -> Iterator[_JointSums]:
         """The rows of a body at each of its stops."""
         noisy = replace(block, weight=None, stops=block.stops.with_joint_noise(NOISE))
-        count, K = len(block.stops.rig.joint_names), len(block.measured)
-        residual, d = noisy.evaluate({**whole.values, NOISE: np.zeros(count)}, True)
-        columns = whole.layout.columns([name for name in d if name != NOISE])
-        A = np.hstack([x for name, x in d.items() if name != NOISE])
-        for Z, A_k, r in zip(*(np.split(x, K) for x in (d[NOISE], A, residual)), strict=True):
+        count = len(block.stops.rig.joint_names)
+        residual, d = noisy.whitened({**whole.values, NOISE: np.zeros(count)}, True)
+        names = [name for name in d if name != NOISE]
+        columns, (A, _) = whole.layout.columns(names), d.table(names)
+        for Z, A_k, r in zip(d[NOISE], A, residual, strict=True):
             yield cls(Z.T @ Z, -Z.T @ r, Z.T @ A_k, columns)
 
     @classmethod

@@ -113,11 +113,11 @@ def body_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whitened rows of K blocks: derivatives (K, m, n), right sides (K, m), and by which columns
     (K, n): first those of the stops' own unknowns, but where only some of the stops have such."""
-    residual, d = together.evaluate_all(values)
-    at = {name: layout.columns_of_each(together.named(name)) for name in d}
-    names = sorted(d, key=lambda name: layout.owner[at[name][0, 0]] < 0)
+    at = {n: layout.columns_of_each(together.named(n)) for n in together.whole.variables}
+    names = sorted(at, key=lambda name: layout.owner[at[name][0, 0]] < 0)
+    residual, A, _ = together.table(values, names)
     each = [np.broadcast_to(at[name], (len(residual), at[name].shape[1])) for name in names]
-    return np.concatenate([d[name] for name in names], axis=2), -residual, np.hstack(each)
+    return A, -residual, np.hstack(each)
 
 
 def _told_apart(

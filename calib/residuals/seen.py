@@ -11,8 +11,8 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from calib.effects import View
-from calib.forward import Derivatives, Placed, Stops, Term, Values, stacked
+from calib.effects import Site, View
+from calib.forward import BySite, Derivatives, Placed, Stops, Term, Values, stacked
 from calib.residuals.groups import Group
 from chains import se3
 
@@ -176,24 +176,27 @@ class SeenBody(ABC):
             back, by = se3.adjoint(se3.inverse(se3.exp(added))), se3.right_jacobian(added)
             if self.by_place:
                 back = back + by @ self.by_place.turned(placed.T, values)
-            d = {name: back @ each for name, each in d.items()}
-            d |= {name: by @ basis for name, basis in bases.items()}
+            d = d.then(back).at_site(Site.TRACKER, by, bases)
         return Placed(placed.T @ se3.exp(added), d)
 
     def evaluate(self, values: Values, derivatives: bool) -> tuple[np.ndarray, Derivatives | None]:
-        """Whitened rows, stop by stop, and their derivatives."""
+        """Whitened rows (K n,), stop by stop, and their derivatives (K n, P)."""
+        rows, d = self.whitened(values, derivatives)
+        if not derivatives:
+            return rows.ravel(), None
+        return rows.ravel(), {n: each.reshape(rows.size, -1) for n, each in d.items()}
+
+    def whitened(self, values: Values, derivatives: bool) -> tuple[np.ndarray, BySite | None]:
+        """Whitened rows (K, n), and their derivatives (K, n, P)."""
         seen = self.seen(values, derivatives)
         rows, by_twist, direct = self.compare(seen.T, values)
         weight = 1.0 / self.sigma
         if self.weight is not None:
             weight = weight * np.sqrt(self.weight)[:, None]
-        residual = (rows * weight).ravel()
         if not derivatives:
-            return residual, None
-        by_twist = by_twist * weight[..., None]
-        d = {n: by_twist @ np.asarray(each) for n, each in seen.d.items()}
-        d |= {n: each * weight[..., None] for n, each in direct.items()}
-        return residual, {n: each.reshape(len(residual), -1) for n, each in d.items()}
+            return rows * weight, None
+        direct = {name: each * weight[..., None] for name, each in direct.items()}
+        return rows * weight, seen.d.then(by_twist * weight[..., None]).beside(direct)
 
 
 @dataclass(frozen=True)
@@ -221,14 +224,17 @@ class BodiesTogether:
 
     def residuals(self, values: Values) -> Iterator[np.ndarray]:
         """Whitened rows (m,) of each block."""
-        residual, _ = self.whole.evaluate({**values, **self._at(values)}, False)
-        return iter(residual.reshape(len(self.blocks), -1))
+        rows, _ = self.whole.whitened({**values, **self._at(values)}, False)
+        return iter(rows.reshape(len(self.blocks), -1))
 
-    def evaluate_all(self, values: Values) -> tuple[np.ndarray, Derivatives]:
-        """Whitened rows (K, m) of the K blocks, and their derivatives (K, m, n); see `named`."""
-        residual, d = self.whole.evaluate({**values, **self._at(values)}, True)
-        rows = residual.reshape(len(self.blocks), -1)
-        return rows, {name: x.reshape(*rows.shape, -1) for name, x in d.items()}
+    def table(
+        self, values: Values, names: Sequence[str]
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, slice]]:
+        """Whitened rows (B, m) of the B blocks, their derivatives (B, m, N) by all that the whole
+        depends on, in the order of names, and which columns are whose; see `named`."""
+        rows, d = self.whole.whitened({**values, **self._at(values)}, True)
+        A, at = d.table(names)
+        return rows.reshape(len(self.blocks), -1), A.reshape(len(self.blocks), -1, A.shape[2]), at
 
     def named(self, name: str) -> Sequence[str]:
         """What the unknown of the whole is called in each of the blocks; once, if all share it."""
@@ -236,10 +242,10 @@ class BodiesTogether:
 
     def evaluate(self, values: Values) -> Iterator[tuple[np.ndarray, Derivatives]]:
         """Rows and derivatives of each block, as `SeenBody.evaluate` gives them."""
-        rows, by = self.evaluate_all(values)
+        rows, A, at = self.table(values, self.whole.variables)
         for k, block in enumerate(self.blocks):
             named = dict(zip(self.whole.stops.own, block.stops.own, strict=True))
-            yield rows[k], {named.get(name, name): x[k] for name, x in by.items()}
+            yield rows[k], {named.get(name, name): A[k][:, its] for name, its in at.items()}
 
     def in_world(self, values: Values) -> Iterator[np.ndarray]:
         """T_world_body (K, 4, 4) of each block, without what the instrument adds."""

@@ -134,19 +134,25 @@ def test_covariances_are_those_of_dense_rows(case, together):
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
 
 
-def test_one_that_moves_alone_is_followed_as_any_other(case, together):
-    """Each of some of the kept in a direction of its own, in any order, others with it."""
+def test_reduced_rows_say_the_same_of_all_that_follows_the_kept(case, together, monkeypatch):
+    """Rows about a few unknowns of any kind, of which one may stand twice, or about none."""
+    monkeypatch.setattr("calib.linear.system.ROWS_AT_ONCE", 3)
     linear, rng = case.linear(), np.random.default_rng(6)
-    kept = linear.layout.sigma[linear.layout.kept]
-    order = rng.permutation(len(kept))
-    one, others = order[: len(kept) // 3], order[len(kept) // 2 :]
-    taken = rng.normal(size=(len(others), len(one))) * kept[others, None]
-    moves = np.zeros((len(kept), len(one)))
-    moves[one], moves[others] = np.eye(len(one)), -taken
-    expected = linear.followed(moves)
-    found = linear.away(one, others, taken)
-    size = np.abs(expected).max(axis=1, keepdims=True).clip(1e-300)
+    layout, kept = linear.layout, np.diag(linear.layout.sigma[linear.layout.kept])
+    parts = [layout.finest, layout.cells, layout.kept, *layout.own.values()]
+    touched = [rng.choice(part, 3) for part in parts if len(part)] + [np.zeros(0, int)]
+    touched += [np.concatenate([touched[0], some]) for some in touched]
+    ends = np.cumsum([0, *map(len, touched)])
+    columns = np.concatenate(touched)
+    entries = rng.normal(size=len(columns)) / layout.sigma[columns]
+    rows = csr_array((entries, columns, ends), shape=(len(touched), layout.size))
+    before = rows.indices.copy(), rows.data.copy()
+    expected = rows.toarray() @ linear.followed(kept)
+    found = linear.reduced(rows) @ kept
+    size = np.abs(expected).max(axis=0).clip(1e-300)
     np.testing.assert_allclose(found / size, expected / size, atol=1e-9)
+    for now, then in zip((rows.indices, rows.data), before, strict=True):
+        np.testing.assert_array_equal(now, then)
 
 
 def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, together):
