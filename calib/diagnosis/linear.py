@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
+from calib.linear.assembly import add_alone
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
@@ -55,7 +56,7 @@ class Linear:
         at: unknown -> its columns among the S, of those that were not eliminated.
         columns: unknown -> its columns among all U.
         information: (S, S) of all rows; the priors of the hardware widened.
-        raw: (S, S) the same before anything was eliminated.
+        raw: unknown -> (n, n) the same of it alone, before anything was eliminated.
         gradient: (C, S) of each cluster of rows.
         score: (S,) the whole gradient, of residuals as they are.
         others: all rows but those of beams, of residuals as large as errors are.
@@ -74,7 +75,7 @@ class Linear:
     at: Mapping[str, np.ndarray]
     columns: Mapping[str, slice]
     information: np.ndarray
-    raw: np.ndarray | None
+    raw: Mapping[str, np.ndarray] | None
     gradient: np.ndarray
     score: np.ndarray
     others: Sequence[ClusteredRows | OwnRows]
@@ -177,17 +178,21 @@ def linearise_with(
             alike.setdefault(rows.columns.tobytes(), []).append(rows)
     for some in alike.values():
         place, sigma = at[some[0].columns], layout.sigma[some[0].columns]
-        gram = square(np.vstack([rows.A for rows in some]) * sigma)
-        information[np.ix_(place, place)] += gram
-        raw[np.ix_(place, place)] += gram
+        A = np.vstack([rows.A for rows in some]) * sigma
+        information[np.ix_(place, place)] += square(A)
+        add_alone(raw, layout, A, some[0].columns)
     grown = Leverage.of(information, layout, values, WIDENED).grown(others, layout)
     more = np.zeros(layout.size)
     for rows, larger in zip(others, grown, strict=True):
         gradients.add_entries(*larger.gradients())
         rows.add_gradient(larger.b - rows.b, more)
-    for each in (information, raw):  # in their place: there may be thousands of columns
-        each /= layout.sigma[layout.kept]
-        each /= layout.sigma[layout.kept, None]
+    # In their place: there may be thousands of columns.
+    for told, unit in [
+        (information, layout.sigma[layout.kept]),
+        *((block, layout.sigma[layout.at[name]]) for name, block in raw.items()),
+    ]:
+        told /= unit
+        told /= unit[:, None]
     table, stop, place = gradients.table()
     whole = csr_array(table.sum(axis=0)[None] - more)
     return Linear(

@@ -37,7 +37,8 @@ class Scores:
         owner: candidate -> whose it is.
         score: (Q,).
         information: (Q, Q) left after projection.
-        whole: (Q, Q) before it.
+        felt: (Q,) of each alone, before it.
+        whole: candidate -> (q, q) of its parameters, before it.
         cells: (C, Q) shares of the score, of rows of one stop and one place, by
             residuals as large as errors are (`leverage`).
         stop, place: (C,) the numbers of these, -1 for none.
@@ -49,7 +50,8 @@ class Scores:
     owner: Mapping[str, Owner]
     score: np.ndarray
     information: np.ndarray
-    whole: np.ndarray
+    felt: np.ndarray
+    whole: Mapping[str, np.ndarray]
     cells: np.ndarray
     stop: np.ndarray
     place: np.ndarray
@@ -59,6 +61,25 @@ class Scores:
     def thinned(self) -> Scores:
         """The same without clusters, of which nothing more is asked."""
         return replace(self, cells=self.cells[:0].copy(), stop=NONE, place=NONE)
+
+    def moved(self, columns: np.ndarray, theta: np.ndarray) -> float:
+        """Sum of the squares by which parameters (q,) in some columns move all rows, the model's
+        part included."""
+        every = np.zeros(len(self.score))
+        every[columns] = theta
+        return sum(float(every[at] @ self.whole[n] @ every[at]) for n, at in self.at.items())
+
+    def told_as(self, columns: np.ndarray, other: Scores, its: np.ndarray) -> Scores:
+        """The same, with what all rows tell of some parameters as other scores have it of theirs,
+        both given by all columns of as many candidates of the same sizes."""
+        mine, theirs = (
+            [n for n, at in scores.at.items() if np.isin(np.r_[at], some).any()]
+            for scores, some in ((self, columns), (other, its))
+        )
+        felt = self.felt.copy()
+        felt[columns] = other.felt[its]
+        blocks = {n: other.whole[m] for n, m in zip(mine, theirs, strict=True)}
+        return replace(self, felt=felt, whole={**self.whole, **blocks})
 
     @cached_property
     def by_stop(self) -> np.ndarray:
@@ -152,7 +173,8 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         owner={name: linear.owner[name] for name in names},
         score=linear.score[theirs] - linear.score[model] @ taken,
         information=_left(linear, theirs, model, taken),
-        whole=linear.raw[np.ix_(theirs, theirs)],
+        felt=np.concatenate([np.diag(linear.raw[name]) for name in names]),
+        whole={name: linear.raw[name] for name in names},
         cells=linear.gradient[:, theirs] - linear.gradient[:, model] @ taken,
         stop=linear.stop,
         place=linear.place,
@@ -267,7 +289,7 @@ def evidence(statistic: float, dof: int, common: float) -> float:
 def explained(scores: Scores, columns: np.ndarray) -> tuple[np.ndarray, float]:
     """What (q, r) makes the scores of some columns (q,) r independent ones of variance 1; and the
     sum of the squares of these."""
-    size = np.sqrt(np.maximum(np.diag(scores.whole)[columns], 0.0))
+    size = np.sqrt(np.maximum(scores.felt[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
     block = scores.information[np.ix_(columns, columns)]
     values, axes = np.linalg.eigh(block / np.outer(size, size))

@@ -62,9 +62,8 @@ class Screen:
 
     def size_m(self, candidate: Candidate) -> float:
         """Root mean square of what it does to the ranges, all that the model absorbs included."""
-        theta, columns = candidate.test.estimate(), candidate.test.columns
-        whole = self.scores.whole[np.ix_(columns, columns)]
-        return float(np.sqrt(theta @ whole @ theta / max(self.scores.weight_m2, 1e-300)))
+        moved = self.scores.moved(candidate.test.columns, candidate.test.estimate())
+        return float(np.sqrt(moved / max(self.scores.weight_m2, 1e-300)))
 
     def rms_m(self, candidate: Candidate) -> float:
         """Root mean square of the range residual that it alone can explain."""

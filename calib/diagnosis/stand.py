@@ -130,7 +130,7 @@ class Stand:
         chance = [e for e in known if e.by_chance]
         named = [e for e in known if e.site is not Site.NOISE and not e.by_chance]
         named = screen(scores, named, at)
-        felt = np.sqrt(np.maximum(np.diag(scores.whole), 0.0))
+        felt = np.sqrt(np.maximum(scores.felt, 0.0))
         alone, each = singly(unnamed, of_rigs, felt)
         rest = screen(scores, alone, each, named.common if named.candidates else None)
         noise = screen(scores, [e for e in known if e.site is Site.NOISE], at, 1.0)
@@ -314,9 +314,10 @@ class Look:
             return self, replace(candidate, effect=finest.effect)
         here, there = (np.ix_(each, each) for each in (columns, finest.test.columns))
         scores, shaped = self.named.scores, near.named.scores
-        whole, information = scores.whole.copy(), scores.information.copy()
-        whole[here], information[here] = shaped.whole[there], shaped.information[there]
-        changed = replace(scores, whole=whole, information=information)
+        information = scores.information.copy()
+        information[here] = shaped.information[there]
+        told = scores.told_as(columns, shaped, finest.test.columns)
+        changed = replace(told, information=information)
         named = replace(self.named, scores=changed)
         moved = replace(finest, test=replace(finest.test, columns=columns))
         return replace(self, named=named), moved

@@ -6,14 +6,13 @@ grows with the number of stops, and most of the work is in products of large mat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.blas import dsyrk
 
-from calib.linear.elimination import Eliminated, eliminate, square
+from calib.linear.elimination import Eliminated, add_square, eliminate, square
 from calib.linear.layout import Layout, positions
 from calib.linear.own import OwnRows, alike
 from calib.linear.rows import TWIST, OwnSums, StopSums
@@ -76,12 +75,12 @@ class Assembly:
     Args:
         layout: which column is what.
         own: rows about stops' own unknowns, those of priors last.
-        raw: whether the Gram matrix before eliminations is wanted.
+        raw: whether what rows tell of each kept unknown before eliminations is wanted.
     """
 
     def __init__(self, layout: Layout, own: Sequence[OwnRows], raw: bool) -> None:
         self.layout, self.rows, self.waiting = layout, own, _waiting(layout, own)
-        self.raw = np.zeros((len(layout.kept), len(layout.kept))) if raw else None
+        self.raw = {n: np.zeros((u.dim, u.dim)) for n, u in layout.outer().items()} if raw else None
         self.cells = np.concatenate([layout.finest, layout.cells])
         self.columns = np.concatenate([self.cells, layout.kept, [layout.size]])
         self.at = positions(layout.size + 1, self.columns)
@@ -147,8 +146,10 @@ class Assembly:
         self._finish_scanned()
         count, stops = len(self.cells), list(self.waiting)
         if self.raw is not None:
-            self.raw += self.half[count:-1, count:-1]
-            self.raw += self.raw.T.copy()
+            for name, told in self.raw.items():
+                first = self.at[self.layout.at[name].start]
+                mine = slice(first, first + len(told))
+                told += self.half[mine, mine] + self.half[mine, mine].T
             self.half += self.taken
         for first in range(0, len(stops), STOPS_TOGETHER):
             self._finish_without_beams(stops[first : first + STOPS_TOGETHER])
@@ -253,7 +254,7 @@ class Assembly:
         by_rows = Q.mT @ np.linalg.solve(factor, by_rows)
         W, beyond = R[:, :wide] @ Z, by_rows[:, wide:]
         W[:, :, others] += by_rows[:, :wide]
-        _add_square(self.taken, W.reshape(-1, W.shape[2]), -1.0)
+        add_square(self.taken, W.reshape(-1, W.shape[2]), -1.0)
         self.taken[np.ix_(others, others)] -= square(beyond.reshape(-1, len(others))) / 2
         turned = np.linalg.solve(factor.mT, Q)
         gain = turned[:, :, :wide] @ W
@@ -284,7 +285,7 @@ class Assembly:
             rows, told = self._stacked(some, at, len(mine))
             over, shared = mine[len(self._own(some[0])) :], rows[:, :, len(self._own(some[0])) :]
             if self.raw is not None:
-                self._add_raw(shared[:, :told, :-1], over[:-1])
+                add_alone(self.raw, self.layout, shared[:, :told, :-1], over[:-1])
             if count := len(mine) - len(over):
                 Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
                 inverse = np.linalg.inv(R[:, :count])
@@ -294,19 +295,9 @@ class Assembly:
                     for stop, root, gain in zip(some, R[:, :count], gains, strict=True)
                 ]
                 shared = _turned(Q[:, :, count:].mT, shared, told)
-            _add_square(self.half, _over(shared, self.at, over))
+            add_square(self.half, _over(shared, self.at, over))
             for stop in some:
                 del self.waiting[stop]
-
-    def _add_raw(self, rows: np.ndarray, columns: np.ndarray) -> None:
-        """Add the products of rows (K, m, n) over kept columns (n,), of each unknown by itself."""
-        place = positions(self.layout.size, self.layout.kept)[columns]
-        first = [at.start for at in self.layout.at.values()]
-        of = np.searchsorted(first, columns, side="right")
-        each = np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1)
-        for some in each if len(columns) else ():
-            mine = rows[:, :, some[0] : some[-1] + 1].reshape(-1, len(some))
-            self.raw[np.ix_(place[some], place[some])] += mine.T @ mine
 
     # ------------------------------------------------------------------------- stops' own rows
 
@@ -347,6 +338,20 @@ class Assembly:
         return out, sum(rows.of_each for rows, _ in parts if rows.measured)
 
 
+def add_alone(
+    raw: Mapping[str, np.ndarray], layout: Layout, rows: np.ndarray, columns: np.ndarray
+) -> None:
+    """Add to products of kept unknowns, of each by itself, those of rows (..., n) over columns
+    (n,)."""
+    names, first = list(layout.at), np.array([at.start for at in layout.at.values()])
+    of = np.searchsorted(first, columns, side="right") - 1
+    each = np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1)
+    for some in each if len(columns) else ():
+        mine = rows[..., some[0] : some[-1] + 1].reshape(-1, len(some))
+        which, at = of[some[0]], columns[some]
+        raw[names[which]][np.ix_(at - first[which], at - first[which])] += mine.T @ mine
+
+
 class _Waiting(NamedTuple):
     """Rows of a stop: of which set, which there, and in which order its own unknowns stand in
     them; a number for each order that there is in the set."""
@@ -369,15 +374,6 @@ def _waiting(layout: Layout, own: Sequence[OwnRows]) -> dict[int, list[_Waiting]
         for at, (stop, like) in enumerate(zip(rows.stops.tolist(), order.tolist(), strict=True)):
             found[stop].append(_Waiting(of, at, like))
     return found
-
-
-def _add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> None:
-    """Add ``rows.T @ rows`` so many times to a matrix of which half is held, below its diagonal."""
-    if not target.size:
-        return  # which BLAS refuses
-    # Each pair of columns once, and each column by itself twice as much as is held of it.
-    dsyrk(times, rows.T, beta=1.0, c=target.T, overwrite_c=1)
-    np.einsum("ii->i", target)[:] -= times * np.einsum("ij,ij->j", rows, rows) / 2
 
 
 def _turned(turn: np.ndarray, rows: np.ndarray, told: int) -> np.ndarray:

@@ -15,6 +15,8 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
+MIRRORED_AT_ONCE = 128  # rows and columns: a square of them stays in a cache
+
 
 @dataclass(frozen=True)
 class Eliminated:
@@ -56,19 +58,39 @@ def eliminate(
         block: (e, e) of those, positive definite, of which only what is on the diagonal and below
             it is read; or (e,) where it is diagonal.
         cross: (e, r) of them and the others.
-        rest: (r, r) of the others, symmetric; the Schur complement takes its place.
+        rest: (r, r) of the others, symmetric and contiguous; the Schur complement takes its place.
 
     Returns:
         The factor and the gain, as `Eliminated` has them.
     """
     if block.ndim == 1:
         root = np.sqrt(block)[:, None]
-        rest -= square(cross / root)
+        _take_square(rest, cross / root)
         return block, cross / block[:, None]
     factor = cholesky(block, lower=True, check_finite=False)
     half = solve_triangular(factor, cross, lower=True, check_finite=False)
-    rest -= square(half)
+    _take_square(rest, half)
     return factor, solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
+
+
+def _take_square(symmetric: np.ndarray, rows: np.ndarray) -> None:
+    """Subtract ``rows.T @ rows``, computed once per pair of columns, from a matrix (n, n), which is
+    large: so no other of its size is made."""
+    dsyrk(-1.0, rows.T, beta=1.0, c=symmetric.T, overwrite_c=1)  # on the diagonal, and below it
+    for first in range(0, len(symmetric), MIRRORED_AT_ONCE):
+        some = slice(first, first + MIRRORED_AT_ONCE)
+        square_part = symmetric[some, some]
+        square_part[:] = np.tril(square_part) + np.tril(square_part, -1).T
+        symmetric[some, some.stop :] = symmetric[some.stop :, some].T
+
+
+def add_square(target: np.ndarray, rows: np.ndarray, times: float = 1.0) -> None:
+    """Add ``rows.T @ rows`` so many times to a matrix of which half is held, below its diagonal."""
+    if not target.size:
+        return  # which BLAS refuses
+    # Each pair of columns once, and each column by itself twice as much as is held of it.
+    dsyrk(times, rows.T, beta=1.0, c=target.T, overwrite_c=1)
+    np.einsum("ii->i", target)[:] -= times * np.einsum("ij,ij->j", rows, rows) / 2
 
 
 def square(rows: np.ndarray) -> np.ndarray:

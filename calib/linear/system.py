@@ -32,9 +32,8 @@ class Linearisation:
         kept: (S + 1, S + 1) Gram matrix over the layout's kept columns and, last, the right side b,
             in units of the priors' sigmas; without the priors of the kept, and without the layout's
             other blocks. Its last diagonal entry is what of chi2 the eliminated cannot take away.
-        raw: (S, S) the Gram matrix of the kept columns before anything was eliminated, where
-            gradients were asked for; with all products of columns of one unknown, and of different
-            unknowns those that beams have.
+        raw: kept unknown -> (n, n) its Gram matrix before anything was eliminated, where gradients
+            were asked for.
         chi2: of all rows in it, before anything was eliminated.
         touched: (U,) bool, whether any beam or tracked body depends on a column.
         eliminated: what was eliminated, in that order.
@@ -50,7 +49,7 @@ class Linearisation:
     layout: Layout
     values: Values
     kept: np.ndarray
-    raw: np.ndarray | None
+    raw: Mapping[str, np.ndarray] | None
     chi2: float
     touched: np.ndarray
     eliminated: Sequence[Eliminated]

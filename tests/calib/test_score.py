@@ -1,6 +1,5 @@
 """The score test: against a dense re-solve, against chance, and against what it must not see."""
 
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -69,26 +68,16 @@ class World:
             at={name: np.r_[at] for name, at in columns.items()},
             columns=columns,
             information=J.T @ J,
-            raw=J.T @ J,
-            gradient=csr_array(pick @ J),
+            raw={name: J[:, at].T @ J[:, at] for name, at in columns.items()},
+            gradient=np.asarray(pick @ J),
             score=J.T @ fitted,
             others=(),
             stop=stop,
             place=place,
             places={},
             weight_m2=float(len(J)),
-            whole=SimpleNamespace(
-                away=partial(_away, J.shape[1]),
-                layout=SimpleNamespace(finest=np.zeros(0, int), cells=np.zeros(0, int)),
-            ),
+            whole=None,
         )
-
-
-def _away(unknowns, one, others, taken):
-    """Directions (U, q) in unknowns of which none was eliminated."""
-    out = np.zeros((unknowns, len(one)))
-    out[one], out[others] = np.eye(len(one)), -taken
-    return out
 
 
 def scores(world):

@@ -60,7 +60,7 @@ def curves(screen: Screen) -> list[Curve]:
 
 def _curve(screen: Screen, effect: Binned, columns: slice, rig: str) -> Curve:
     scores = screen.scores
-    weight = np.diag(scores.whole)[columns]
+    weight = scores.felt[columns]
     weight = np.where(weight > 1e-9 * weight.max(), weight, np.nan)
     ways = (scores.by_stop[:, columns], scores.by_place[:, columns], scores.by_both(columns))
     squares = TwoWay.of(*ways)

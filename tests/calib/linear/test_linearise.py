@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from calib.linear import assembly
@@ -66,9 +67,10 @@ def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, together):
     size = sizes(rows.T @ rows)
     unit = np.outer(size, size)
     np.testing.assert_allclose(linear.kept / unit, beyond.T @ beyond / unit, atol=1e-9)
-    raw, each = (rows.T @ rows)[:-1, :-1], np.repeat(*unknown_of(linear.layout))
-    one = each[:, None] == each
-    np.testing.assert_allclose(np.where(one, linear.raw - raw, 0.0) / unit[:-1, :-1], 0, atol=1e-9)
+    each = np.repeat(*unknown_of(linear.layout))
+    alone = np.where(each[:, None] == each, (rows.T @ rows)[:-1, :-1], 0.0)
+    found = block_diag(*linear.raw.values())
+    np.testing.assert_allclose((found - alone) / unit[:-1, :-1], 0, atol=1e-9)
     assert linear.chi2 == pytest.approx(b @ b, rel=1e-9)
     # And the way back to what was eliminated: of directions, and of one with the right side.
     ahead = np.random.default_rng(2).normal(size=(len(kept) + 1, 3)) / size[:, None]
@@ -259,10 +261,11 @@ def test_stops_taken_out_one_by_one_or_at_once_say_the_same(case, monkeypatch):
         monkeypatch.setattr(assembly, "WAITING_ENTRIES", entries)
         found.append(case.linear(gradients=Gradients(len(case.dense.sigma))))
     a, b = found
-    size = np.append(sizes(a.raw), np.sqrt(a.chi2))
+    raw, other = (block_diag(*linear.raw.values()) for linear in found)
+    size = np.append(sizes(raw), np.sqrt(a.chi2))
     unit = np.outer(size, size)
     np.testing.assert_allclose(a.kept / unit, b.kept / unit, atol=1e-10)
-    np.testing.assert_allclose(a.raw / unit[:-1, :-1], b.raw / unit[:-1, :-1], atol=1e-12)
+    np.testing.assert_allclose(raw / unit[:-1, :-1], other / unit[:-1, :-1], atol=1e-12)
     assert a.chi2 == pytest.approx(b.chi2, rel=1e-12)
 
 
@@ -272,7 +275,7 @@ def test_the_number_of_threads_changes_no_bit(case, together):
         with workers(count):
             linear = case.linear(gradients=gradients)
         table = gradients.table() if case.start.problem.scans else ()
-        arrays = [linear.kept, linear.raw, linear.chi2, linear.weight_m2, linear.touched]
+        arrays = [linear.kept, *linear.raw.values(), linear.chi2, linear.weight_m2, linear.touched]
         arrays += [a for e in linear.eliminated for a in (e.columns, e.over, e.factor, e.gain)]
         return arrays + [a.toarray() if hasattr(a, "toarray") else a for a in table]
 
