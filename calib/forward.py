@@ -53,7 +53,8 @@ class Term:
         except NoColumnError as error:
             if f"'{self.effect.name}'" in str(error):  # as formulas say
                 raise
-            raise NoColumnError(f"effect '{self.effect.name}': {error}") from None
+            said = f"effect '{self.effect.name}': {error}"
+            raise NoColumnError(said, error.column) from None
         if not isinstance(basis, OneHot):
             return basis if len(self.free) == basis.shape[-1] else basis[..., self.free]
         column = np.full(basis.size + 1, -1)  # the last stands for index -1: none

@@ -20,6 +20,10 @@ class CutShortError(InputError):
 class NoColumnError(InputError):
     """A recording has not the column that an effect looks at."""
 
+    def __init__(self, message: str, column: str) -> None:
+        super().__init__(message)
+        self.column = column
+
 
 LONGEST_NAME = 80  # bytes: tables are called RIG.STOP.parquet, and file systems take 255
 

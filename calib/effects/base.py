@@ -87,7 +87,8 @@ class View:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.columns:
             known = ", ".join(sorted(self.columns))
-            raise NoColumnError(f"column '{name}' is not in this recording, which has {known}.")
+            said = f"column '{name}' is not in this recording, which has {known}."
+            raise NoColumnError(said, name)
         column = self.columns[name]
         return column() if callable(column) else column
 

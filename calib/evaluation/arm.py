@@ -14,6 +14,8 @@ from typing import Self
 import numpy as np
 
 from calib.effects import Effect, Site, View
+from calib.evaluation.poses import basis_at, loads_felt, moves, pose_columns
+from calib.problem.model import Source
 from calib.results.solution import Part
 from calib.rig import Rig
 from calib.runs.reopen import model_of, reopened
@@ -53,13 +55,13 @@ class Arm:
     """An arm as a run found it.
 
     Args:
-        rig: as on paper.
+        source: the recording that was fitted, with the rig as on paper.
         effects: those of the model that bend it, each with its estimate (P,).
         frames: T_parent_child (4, 4) of the frames of ``rig.yaml`` as fitted.
         base, tip: from where to where: the arm's own, or any frame before and behind it.
     """
 
-    rig: Rig
+    source: Source
     effects: Sequence[tuple[Effect, np.ndarray]]
     frames: Mapping[str, np.ndarray]
     base: str
@@ -84,13 +86,15 @@ class Arm:
             raise InputError(f"{run.folder}: it has no rig '{rig}'")
         part = run.solution.part(found[0].rig.name if run.solution.recordings else None)
         known = {effect.name: effect for effect in model_of(run).effects}
-        return cls.as_found(found[0].rig, part, known, tip)
+        return cls.as_found(found[0], part, known, tip)
 
     @classmethod
     def as_found(
-        cls, rig: Rig, part: Part, known: Mapping[str, Effect], tip: str | None = None
+        cls, source: Source, part: Part, known: Mapping[str, Effect], tip: str | None = None
     ) -> Self:
-        """The arm of a rig, of which a part of a solution says what was found; see `of`."""
+        """The arm of a recording's rig, of which a part of a solution says what was found; see
+        `of`."""
+        rig = source.rig
         if not rig.joint_names:
             raise InputError(f"rig {rig.name} has no arm")
         base, tip = rig.arm_base, tip or rig.tips[0]
@@ -99,8 +103,9 @@ class Arm:
             raise InputError(f"frame '{tip}' is not carried by the arm; name one that it carries")
         bends = {n: e for n, e in known.items() if e.site in (Site.EDGE, Site.JOINTS)}
         bends = {n: e for n, e in bends.items() if n in part.effects and not e.by_chance}
+        bends = {n: e for n, e in bends.items() if e.site is Site.JOINTS or moves(source, e, tip)}
         return cls(
-            rig=rig,
+            source=source,
             effects=[(effect, part.effects[name].estimate) for name, effect in bends.items()],
             frames={name: frame.T_parent_child for name, frame in part.frames.items()},
             base=base,
@@ -109,6 +114,9 @@ class Arm:
 
     def corrected(self, joints: np.ndarray, columns: Columns | None = None) -> np.ndarray:
         """T_base_tip (K, 4, 4), true as far as the model tells.
+
+        The base is where it stands at rest: what tilts or shifts it from pose to pose, as
+        `base_flex` does, moves the tip.
 
         Args:
             joints: (K, J) reported, rad or m, in the order of `Rig.joint_names`.
@@ -201,16 +209,26 @@ class Arm:
         return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]])
 
     def _placed(self, joints: np.ndarray, columns: Columns) -> np.ndarray:
-        view = View(self.rig, len(joints), columns, joints)
+        asked = pose_columns(self.source, joints, columns, self._felt)
+        view = View(self.rig, len(joints), asked, joints)
         for effect, theta in self.effects:
             if effect.site is Site.JOINTS:
-                joints = joints + np.matvec(effect.basis(view), theta)
+                joints = joints + np.matvec(basis_at(effect, view), theta)
         if not self._varying:
             return self._fixed.place(joints[:, self._ours])
-        twists = self._twists + sum(effect.basis(view) @ theta for effect, theta in self._varying)
-        tree = self.rig.tree
-        T_base, T_tip = (tree.place(f, joints, twists).Ts_root_frame for f in (self.base, self.tip))
-        return se3.inverse(T_base) @ T_tip
+        bent = (basis_at(effect, view) @ theta for effect, theta in self._varying)
+        tree, at_rest = self.rig.tree, self._twists[None]
+        T_base = tree.transform(self.base, joints, at_rest)
+        return se3.inverse(T_base) @ tree.transform(self.tip, joints, self._twists + sum(bent))
+
+    @property
+    def rig(self) -> Rig:
+        """As on paper."""
+        return self.source.rig
+
+    @cached_property
+    def _felt(self) -> dict[str, str]:
+        return loads_felt(self.source, [effect for effect, _ in self.effects])
 
     @cached_property
     def drawn(self) -> SerialChain:

@@ -16,20 +16,19 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import FrameOffset
+from calib.evaluation.poses import loads_felt, pose_columns
 from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
-from calib.problem.model import Source
 from calib.results.intervals import Intervals, intervals
 from calib.results.reach import body_beyond, columns_at, joint_range, placed
-from calib.rig.columns import recorded_columns, stop_columns
 from calib.runs.asked.factors import estimate_of, prior_of
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, shapes_freed
 from chains import se3
-from chains.errors import InputError
+from chains.errors import InputError, NoColumnError
 from sensors.stops import CsvTable, write_columns
 
 AXES = ("x", "y", "z")
@@ -122,7 +121,16 @@ def evaluate_at(
             f"is at these poses"
         )
     told = _known(run, estimate, progress)
-    found = _predicted(run, *told, *_read(Path(poses), problem.sources[0]))
+    read = _read(Path(poses), problem)
+    try:
+        found = _predicted(run, *told, *read)
+    except NoColumnError as error:
+        follows = error.column == "elapsed_s" or error.column.startswith(("travel.", "moved."))
+        wanted = "time_s" if follows else error.column
+        raise InputError(
+            f"{poses}: an effect of the model looks at '{error.column}'; add the column {wanted}, "
+            "with a value for each pose"
+        ) from None
     if out is not None:
         if Path(out).suffix != ".csv":
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
@@ -203,16 +211,19 @@ def over_workspace(
     return found[0], found[1]
 
 
-def _read(path: Path, source: Source) -> tuple[list[str], np.ndarray, dict[str, np.ndarray]]:
+def _read(path: Path, problem: Problem) -> tuple[list[str], np.ndarray, dict[str, np.ndarray]]:
     """Names, joints (K, J) and per-stop covariates of a table of poses."""
     if not path.is_file():
         raise InputError(f"{path} does not exist; give a table with a row for every pose")
-    rig = source.rig
+    source = problem.sources[0]
     table = CsvTable(path, key="stop", text=("location",))
     names = table.names()
-    joints, times = table.joints(rig.joint_names), table.times("time_s")
-    rest = table.rest()
-    return names, joints, {**stop_columns(rig, joints, times, rest), **recorded_columns(rest)}
+    joints, times = table.joints(source.rig.joint_names), table.times("time_s")
+    felt = loads_felt(source, [term.effect for term in problem.terms[0]])
+    try:
+        return names, joints, pose_columns(source, joints, table.rest(), felt, times)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _apart(drawn: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -121,7 +121,8 @@ def calibrate(
                     raise
                 raise NoColumnError(
                     f"{error} (Without --effects the model has the effects of --prior {prior}; "
-                    "with it, those that you name.)"
+                    "with it, those that you name.)",
+                    error.column,
                 ) from None
     return Run.open(out, trust_in(model.effects))
 

@@ -42,11 +42,12 @@ def found(source, names, rng, size=1.0):
 
 
 def in_the_graph(source, known, values, joints, columns, base, tip):
-    """T_base_tip as `calib.forward` has it."""
+    """T_base_tip as `calib.forward` has it, the base where it stands at rest."""
     frames = [calib.effects.FrameOffset(name) for name in source.rig.frame_sigma]
     terms = [Term(e, e.name, np.arange(len(values[e.name]))) for e in (*frames, *known.values())]
     stops = place(source.rig, terms, joints, columns, "root", None)
-    T_base, T_tip = (stops.in_root(frame, values).T for frame in (base, tip))
+    rest = {n: 0 * v if n in known and known[n].covariates else v for n, v in values.items()}
+    T_base, T_tip = stops.in_root(base, rest).T, stops.in_root(tip, values).T
     return se3.inverse(T_base) @ T_tip
 
 
@@ -67,7 +68,7 @@ def test_it_is_where_the_graph_has_it(source, name, tip):
         columns |= {f"moved.{joint}": np.sign(travel), f"travel.{joint}": travel}
     columns["torques"] = rng.uniform(-30, 30, (50, 3))
     columns |= {j: q for j, q in zip(source.rig.joint_names, joints.T, strict=True)}
-    arm = Arm.as_found(source.rig, part, known, tip)
+    arm = Arm.as_found(source, part, known, tip)
     there = in_the_graph(source, known, values, joints, columns, arm.base, arm.tip)
     np.testing.assert_allclose(arm.corrected(joints, columns), there, atol=1e-12)
 
@@ -79,7 +80,7 @@ def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
     source = opened(tmp_path, world, rng, poses=2)
     names = ("arm_link_length", "arm_joint_offset", "arm_geometry", "arm_joint_eccentricity")
     part, known, values = found(source, (*names, "arm_gravity_sag"), rng, size=0.3)
-    arm = Arm.as_found(source.rig, part, known, "tool")
+    arm = Arm.as_found(source, part, known, "tool")
     joints = world.draw(rng, 3000)
     command = arm.to_command(joints)
     wanted = arm.drawn.place(joints)
@@ -103,7 +104,7 @@ def test_an_arm_of_few_joints_says_how_far_it_stays_off(tmp_path):
     world = arm_worlds.bent(tmp_path, "scara", rng, size=0.0)
     source = opened(tmp_path, world, rng, poses=2)
     part, known, _ = found(source, ("arm_link_length", "arm_joint_offset", "arm_geometry"), rng)
-    arm = Arm.as_found(source.rig, part, known)
+    arm = Arm.as_found(source, part, known)
     joints = world.draw(rng, 500)
     command = arm.to_command(joints)
     left = se3.log(se3.inverse(arm.drawn.place(joints)) @ arm.corrected(command.joints))
@@ -118,7 +119,7 @@ def test_an_arm_of_seven_joints_reaches_towards_what_is_out_of_reach(tmp_path):
     source = opened(tmp_path, world, np.random.default_rng(9), poses=2)
     names = ("arm_link_length", "arm_joint_offset", "arm_geometry")
     part, known, _ = found(source, names, np.random.default_rng(9), size=0.3)
-    arm = Arm.as_found(source.rig, part, known)
+    arm = Arm.as_found(source, part, known)
     for seed, beyond_m in ((0, 0.0), (2, 1e-6), (3, 1e-3), (4, 0.3)):
         rng = np.random.default_rng(seed)
         joints = rng.uniform(-2, 2, (200, 7))
@@ -136,13 +137,13 @@ def test_an_arm_of_seven_joints_reaches_towards_what_is_out_of_reach(tmp_path):
 def test_what_cannot_be_is_said(source):
     rng = np.random.default_rng(8)
     part, known, _ = found(source, ["arm_thermal_growth"], rng)
-    arm = Arm.as_found(source.rig, part, known)
+    arm = Arm.as_found(source, part, known)
     with pytest.raises(InputError, match="temperature_c"):
         arm.corrected(np.zeros((2, 3)))
     with pytest.raises(InputError, match=r"\(2, 4\); \(K, 3\) is wanted"):
         arm.corrected(np.zeros((2, 4)))
     with pytest.raises(InputError, match="frame 'base_markers' is not carried by the arm"):
-        Arm.as_found(source.rig, part, known, "base_markers")
+        Arm.as_found(source, part, known, "base_markers")
 
 
 def test_a_run_has_an_arm(shared, tmp_path):

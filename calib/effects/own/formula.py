@@ -193,7 +193,7 @@ class FormulaEffect(Effect):
                 # Columns of several numbers a row are for code, not for formulas.
                 known = [n for n, c in view.columns.items() if callable(c) or np.ndim(c) == 1]
                 said = expression.wrong(f"there is no column {name} here{nearest(name, known)}")
-                raise NoColumnError(str(said))
+                raise NoColumnError(str(said), name)
             values = np.asarray(view[name])
             if values.dtype.kind not in "biuf":
                 raise expression.wrong(f"column {name} holds names, not numbers")
