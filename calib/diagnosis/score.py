@@ -228,6 +228,8 @@ class ScoreTest:
             shares: their rows along the whitened directions.
             scores: those that this test was made from.
         """
+        if not self.dof:
+            return self
         pairs, mine = np.stack([scores.stop, scores.place], axis=1), scores.cells[:, self.columns]
         left_out = shares.left_out(pairs, mine @ self.whiten, self.chances[0].nu, self.spent)
         return replace(self, chances=(*self.chances, *left_out))

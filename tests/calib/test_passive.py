@@ -9,6 +9,8 @@ import pytest
 import yaml
 
 import calib
+from calib.diagnosis.formulas.arm import joint_tables
+from calib.diagnosis.stand import Stand
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
@@ -167,3 +169,13 @@ def test_what_makes_no_sense_of_passive_joints_is_refused(folders, tmp_path):
     rewrite(folder, lambda rig: rig["arm"].update(passive=["joint_2"]))
     with pytest.raises(InputError, match="column joint_5 is missing"):
         Source.open(folder)
+
+
+def test_no_formula_is_sought_for_a_joint_that_nobody_read(folders, tmp_path):
+    """All that it is off by is in its readings, which are free; at a stop where another joint was
+    not read, that is left out likewise."""
+    (source,) = leave_out([Source.open(folders[1])], ["L00P01:joint_3"])
+    problem = build([source], Model())
+    tables = dict(joint_tables(Stand([source], Model(), problem, solve(problem))))
+    assert set(tables) == {f"joint_{i}" for i in (1, 3, 4, 6)}
+    assert [len(tables[joint]) for joint in ("joint_1", "joint_3")] == [40, 39]

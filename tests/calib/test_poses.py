@@ -68,9 +68,9 @@ def test_a_formula_finds_the_joints_among_the_columns(folder):
 def test_a_column_that_is_not_given_is_asked_for(folder):
     source, joints = Source.open(folder), np.zeros((2, 6))
     source.columns["elapsed_s"] = np.arange(60.0)
-    part, known, _ = found(source, ["mount_slip"], np.random.default_rng(0))
+    part, known, _ = found(source, ["mount_creep"], np.random.default_rng(0))
     beyond = Arm.as_found(source, part, known, tip="tool")
-    with pytest.raises(InputError, match=r"'mount_slip.*' looks at column 'elapsed_s', which was"):
+    with pytest.raises(InputError, match=r"'mount_creep' looks at column 'elapsed_s', which was"):
         beyond.corrected(joints)
     plain = Arm.as_found(source, part, {})
     arm = Arm.as_found(source, part, known)  # its own tip, which the mount does not carry

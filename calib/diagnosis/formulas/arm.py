@@ -30,7 +30,8 @@ ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose 
 
 def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     """Each revolute joint that the trackers see, and its table in rad: `residual_m` is how much
-    further it is turned than it says, `sigma_m` how well one pose tells."""
+    further it is turned than it says, `sigma_m` how well one pose tells. Poses at which nobody read
+    the joint are not among them."""
     rig = stand.sources[0].rig
     kinds = zip(rig.joint_names, rig.joint_kinds, strict=True)
     levers = [_lever(i, name) for i, (name, kind) in enumerate(kinds) if kind == "revolute"]
@@ -49,9 +50,21 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     at = {joint: np.searchsorted(shared, mine) for joint, mine in columns.items()}
     model = np.setdiff1d(np.arange(len(shared)), np.concatenate(list(at.values())))
     for joint, columns in at.items():
-        if found := _table(A[:, model], A[:, columns].sum(axis=1), *of_rows, covariates):
+        lever = np.where(_unread(stand, layout, joint)[of_rows[1]], 0.0, A[:, columns].sum(axis=1))
+        if found := _table(A[:, model], lever, *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
             yield joint, replace(found, weight_m2=weight, joints=frozenset(rig.joint_names))
+
+
+def _unread(stand: Stand, layout: Layout, joint: str) -> np.ndarray:
+    """Whether nobody read a joint at each stop of a layout (S + 1,); False of none, which is last:
+    what such a joint is turned by tells nothing but how the rest of the arm is off."""
+    source = stand.sources[0]
+    names, folder = source.recording.stops, source.recording.folder
+    stops = [k for k, name in enumerate(names) if (name, joint) in source.unread]
+    out = np.zeros(max(layout.stops.values(), default=-1) + 2, bool)
+    out[[layout.stops[folder, k] for k in stops if (folder, k) in layout.stops]] = True
+    return out
 
 
 def _shared(layout: Layout) -> np.ndarray:

@@ -227,7 +227,7 @@ def _tail(found: ScoreTest, among: int = 0) -> float:
     """How often chance explains as much as a test found, or, with `among`, as the best function of
     so many parameters does."""
     chance = found.chance
-    if chance.d <= 0.0:
+    if chance.d <= 0.0 or not found.dof:
         return 1.0
     narrower = min(chance.trace / found.dof, 1.0)  # by chance: no less than single rows scatter
     each = chance.over(found.statistic) * found.dof * narrower
