@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
 _SCANS = "scans/"
+_PANDAS_INDEX = "__index_level_"  # what pandas calls an index without a name that it writes
 _BATCH_ROWS = 1 << 20  # read at once: bounds the memory
 _FARTHEST_M = 200.0  # median range, as of clouds that are imported: see `sensors.readers.clouds`
 _LARGEST_SPREAD_M = 0.5  # median of a hold, a choice: of LiDARs 0.01 to 0.05 m, in mm 10 to 50
@@ -330,7 +331,8 @@ def _find_scans(folder: Path, stops: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def _check_types(path: Path, file: "ParquetFile") -> list[str]:
-    """Return the numeric columns, after checking that those every scan needs are among them."""
+    """Return the numeric columns, after checking that those every scan needs are among them. The
+    index of a pandas frame is none of them: it numbers rows."""
     kinds = {field.name: _kind(field.type) for field in file.schema_arrow}
     for name, kind in _KINDS.items():
         if name not in kinds:
@@ -339,7 +341,7 @@ def _check_types(path: Path, file: "ParquetFile") -> list[str]:
             stored = file.schema_arrow.field(name).type
             should = "float32, in metres" if kind == "f" else "uint16"
             raise InputError(f"{path}: column {name} is {stored}; it should be {should}")
-    return [name for name, kind in kinds.items() if kind]
+    return [name for name, kind in kinds.items() if kind and not name.startswith(_PANDAS_INDEX)]
 
 
 def _kind(arrow_type: "pyarrow.DataType") -> str:

@@ -195,14 +195,17 @@ def _at_once(recording: RecordedStops) -> Iterator[str]:
 
 
 def _twice(scans: ScanSums) -> Iterator[Suspect]:
-    """Scans that are copies of each other, and columns that are copied from another scan."""
+    """Scans that are copies of each other, and columns that are copied from another scan. What most
+    scans have alike, as a number of each point, was not measured."""
     copies = {tuple(names) for (c, _), names in scans.contents.items() if c == "points"}
     for names in sorted(copies):
         if len(names) > 1:
             said = f"the scans of {' and '.join(names)} are one and the same; which stop is it of?"
             yield Suspect("scan", names[0], said, stops=names)
+    every = len(set().union(*scans.contents.values()))
     for (column, _), names in scans.contents.items():
-        if len(names) > 1 and column != "points" and tuple(names) not in copies:
+        few = 1 < len(names) < every and len(names) <= max(every / 2, 2)
+        if few and column != "points" and tuple(names) not in copies:
             said = f"column {column} of the scans of {' and '.join(names)} is one and the same"
             yield Suspect("scan", names[0], said, stops=tuple(names))
 

@@ -222,6 +222,17 @@ def test_scans_and_columns_that_are_there_twice(scans):
     assert found.stops == (b, c) and "column t" in found.sentence
 
 
+def test_a_column_that_all_scans_have_alike_numbers_points(scans):
+    length = min(len(scan.ring) for scan in scans[2].values())
+
+    def numbered(scan):
+        rows = ("xyz_m", "ring", "column", "intensity", "count", "range_std_m")
+        cut = {name: getattr(scan, name)[:length] for name in rows}
+        return replace(scan, **cut, extra={"number": np.arange(length)})
+
+    assert said(scans, each=numbered) == []
+
+
 def test_scans_at_one_time(scans):
     rig, recording, read = scans
     time_s = recording.time_s.copy()
