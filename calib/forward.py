@@ -62,7 +62,7 @@ class Term:
         return OneHot(column[basis.index], basis.values, len(self.free))
 
 
-class Part(NamedTuple):
+class SitePart(NamedTuple):
     """What a variable moves at a site: which of the site's components (c,), and the basis
     (K or 1, c, n) by which it does."""
 
@@ -83,7 +83,7 @@ class BySite(Mapping[str, np.ndarray]):
     """
 
     sites: Mapping[Site, np.ndarray]
-    parts: Mapping[str, Sequence[Part]]
+    parts: Mapping[str, Sequence[SitePart]]
     direct: Mapping[str, np.ndarray]
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -116,7 +116,7 @@ class BySite(Mapping[str, np.ndarray]):
         """Those by variables that move all components of one more site, by bases (K or 1, C, n);
         its derivative is d (K, m, C)."""
         every = np.arange(d.shape[2])
-        parts = {name: [Part(site, every, basis)] for name, basis in bases.items()}
+        parts = {name: [SitePart(site, every, basis)] for name, basis in bases.items()}
         return replace(self, sites={**self.sites, site: d}, parts={**self.parts, **parts})
 
     def table(self, names: Iterable[str]) -> tuple[np.ndarray, dict[str, slice]]:
@@ -271,16 +271,16 @@ class Stops:
         joints, twists = self.joints, np.zeros((1, len(self.rig.tree.edges), 6))
         if self.noise is not None:
             joints = joints + values[self.noise]
-        parts: dict[str, list[Part]] = {}
+        parts: dict[str, list[SitePart]] = {}
         for name, basis in self.edge_bases.items():
             twists = twists + self.at_edges(name, basis @ values[name])
             components = (6 * self.edges[name][:, None] + np.arange(6)).ravel()
-            parts[name] = [Part(Site.EDGE, components, _flat(basis))]
+            parts[name] = [SitePart(Site.EDGE, components, _flat(basis))]
         if self.joint_bases:
             joints = joints.copy()
         for name, basis in self.joint_bases.items():
             joints[:, self.axes[name]] += np.matvec(basis, values[name])
-            parts.setdefault(name, []).append(Part(Site.JOINTS, self.axes[name], basis))
+            parts.setdefault(name, []).append(SitePart(Site.JOINTS, self.axes[name], basis))
         if not derivatives:
             return Placed(self.rig.tree.transform(frame, joints, twists), {})
         placed = self.rig.tree.place(frame, joints, twists)

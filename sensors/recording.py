@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 _PARTS = ("rig.yaml", "*.urdf", "stops.csv", "targets.csv", "scans/*.parquet", "reference/*")
 _SCANS = "scans/"
-_PANDAS_INDEX = "__index_level_"  # what pandas calls an index without a name that it writes
 _BATCH_ROWS = 1 << 20  # read at once: bounds the memory
 _FARTHEST_M = 200.0  # median range, as of clouds that are imported: see `sensors.readers.clouds`
 _LARGEST_SPREAD_M = 0.5  # median of a hold, a choice: of LiDARs 0.01 to 0.05 m, in mm 10 to 50
@@ -341,7 +340,7 @@ def _check_types(path: Path, file: "ParquetFile") -> list[str]:
             stored = file.schema_arrow.field(name).type
             should = "float32, in metres" if kind == "f" else "uint16"
             raise InputError(f"{path}: column {name} is {stored}; it should be {should}")
-    return [name for name, kind in kinds.items() if kind and not name.startswith(_PANDAS_INDEX)]
+    return [name for name, kind in kinds.items() if kind and not name.startswith("__index_level_")]
 
 
 def _kind(arrow_type: "pyarrow.DataType") -> str:

@@ -170,31 +170,16 @@ def linearise_with(
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw
-    at = positions(layout.size, layout.kept)
     others = list(other_rows(wide, layout, values, gradients, own))
-    alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
-    for rows in (r for r in others if isinstance(r, ClusteredRows)):
-        if (at[rows.columns] >= 0).all():  # the others are in the linearisation
-            alike.setdefault(rows.columns.tobytes(), []).append(rows)
-    for some in alike.values():
-        place, sigma = at[some[0].columns], layout.sigma[some[0].columns]
-        A = np.vstack([rows.A for rows in some]) * sigma
-        information[np.ix_(place, place)] += square(A)
-        add_alone(raw, layout, A, some[0].columns)
+    _add_others(others, layout, information, raw)
     grown = Leverage.of(information, layout, values, WIDENED).grown(others, layout)
     more = np.zeros(layout.size)
     for rows, larger in zip(others, grown, strict=True):
         gradients.add_entries(*larger.gradients())
         rows.add_gradient(larger.b - rows.b, more)
-    # In their place: there may be thousands of columns.
-    for told, unit in [
-        (information, layout.sigma[layout.kept]),
-        *((block, layout.sigma[layout.at[name]]) for name, block in raw.items()),
-    ]:
-        told /= unit
-        told /= unit[:, None]
+    _in_own_units(layout, information, raw)
     table, stop, place = gradients.table()
-    whole = csr_array(table.sum(axis=0)[None] - more)
+    whole, at = csr_array(table.sum(axis=0)[None] - more), positions(layout.size, layout.kept)
     return Linear(
         candidates=tuple(candidates),
         owner={name: unknown.owner for name, unknown in wide.variables.items()},
@@ -211,6 +196,37 @@ def linearise_with(
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=replace(linear, raw=None, layout=replace(layout, bodies=(), others=())),  # all here
     )
+
+
+def _add_others(
+    others: Sequence[ClusteredRows | OwnRows],
+    layout: Layout,
+    information: np.ndarray,
+    raw: Mapping[str, np.ndarray],
+) -> None:
+    """Add rows that are about kept unknowns alone, the others being in a linearisation, to what
+    that tells of these together, and of each alone."""
+    at = positions(layout.size, layout.kept)
+    alike: dict[bytes, list[ClusteredRows]] = {}  # of the same unknowns, as most poses of an arm
+    for rows in (r for r in others if isinstance(r, ClusteredRows)):
+        if (at[rows.columns] >= 0).all():
+            alike.setdefault(rows.columns.tobytes(), []).append(rows)
+    for some in alike.values():
+        columns = some[0].columns
+        A = np.vstack([rows.A for rows in some]) * layout.sigma[columns]
+        information[np.ix_(at[columns], at[columns])] += square(A)
+        add_alone(raw, layout, A, columns)
+
+
+def _in_own_units(layout: Layout, information: np.ndarray, raw: Mapping[str, np.ndarray]) -> None:
+    """Turn information in units of sigmas, of all kept unknowns and of each alone, into such in
+    their own; in its place, as there may be thousands of columns."""
+    for told, unit in [
+        (information, layout.sigma[layout.kept]),
+        *((block, layout.sigma[layout.at[name]]) for name, block in raw.items()),
+    ]:
+        told /= unit
+        told /= unit[:, None]
 
 
 def other_rows(

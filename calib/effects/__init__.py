@@ -10,14 +10,9 @@ from typing import Any
 
 from calib.effects.arm import (
     ArmAxisTilt,
-    ArmBacklash,
-    ArmGearError,
     ArmGeometry,
     ArmJointCreep,
-    ArmJointEccentricity,
-    ArmJointLag,
     ArmJointOffset,
-    ArmJointScale,
     ArmJointSettle,
     ArmJointSlip,
     ArmJointThermal,
@@ -44,6 +39,14 @@ from calib.effects.beams import (
     RingAzimuthOffset,
     RingElevationOffset,
     SpinAxisWobble,
+)
+from calib.effects.drives import (
+    ArmBacklash,
+    ArmGearError,
+    ArmJointEccentricity,
+    ArmJointLag,
+    ArmJointScale,
+    ArmScrewError,
 )
 from calib.effects.elastic import (
     ArmGravitySag,
@@ -84,12 +87,13 @@ from calib.effects.scatter import (
     TargetScatter,
     TrackerScatter,
 )
-from calib.effects.targets import TargetRodTilt, TargetSphereOffset
 from calib.effects.tracker import (
     BaseSlip,
     BodySlip,
     OptitrackDistortion,
     OptitrackScale,
+    TargetRodTilt,
+    TargetSphereOffset,
     TrackerCreep,
     TrackerSettle,
     TrackerSlip,
@@ -138,6 +142,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmBacklash(),
     ArmJointLag(),
     ArmGearError(),
+    ArmScrewError(),
     ArmThermalGrowth(),
     BaseFlex(),
     MountSlip(),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import Creeps, Settles, Slips, warmer_k
+from calib.effects.basis import Creeps, Settles, Slips, joint_units, warmer_k
 from calib.rig import Rig
 from chains.frames import Edge
 from chains.minimal import Own, across, own_errors
@@ -58,7 +58,7 @@ class ArmJointOffset(Effect):
     sigma = 0.005
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param.of_joint(j, unit, self.sigma) for j, unit in _units(rig).items())
+        return tuple(Param.of_joint(j, unit, self.sigma) for j, unit in joint_units(rig).items())
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]
@@ -221,110 +221,6 @@ def _rails(rig: Rig) -> list[Edge]:
     return [e for e in sliding if e.joint.leads and e.joint.name not in rig.passive]
 
 
-class ArmJointScale(Effect):
-    """An encoder counts too many steps a turn: ``true joint = reported * (1 + k)``."""
-
-    name = "arm_joint_scale"
-    site = Site.JOINTS
-    unit = "1"
-    formula = "q_i = reported_i + k_i * reported_i"
-    typical = "up to 0.1 percent, size assumed"
-    covariates = ("joints",)
-    confounded_with = ("arm_joint_offset", "arm_joint_eccentricity")
-    source = "size assumed"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param.of_joint(joint, "1", 0.001) for joint in rig.joint_names)
-
-    def basis(self, view: View) -> np.ndarray:
-        return view.joints[:, :, None] * np.eye(view.joints.shape[1])
-
-
-class ArmJointEccentricity(Effect):
-    """A joint's encoder disc sits off its axis: the angle errs once a turn."""
-
-    name = "arm_joint_eccentricity"
-    joint_kind = "revolute"
-    site = Site.JOINTS
-    unit = "rad"
-    formula = "q_i = reported_i + a_i * sin(reported_i) + b_i * cos(reported_i)"
-    typical = "0.1 to 1 mrad, size assumed"
-    covariates = ("joints",)
-    confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_joint_scale")
-    source = "Judd and Knasinski 1990, IEEE Trans. Robotics and Automation 6(1)"
-    sigma = 0.001
-    shape = 1.0
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        turning = [joint for joint, unit in _units(rig).items() if unit == "rad"]
-        each = [(joint, wave) for joint in turning for wave in ("sin", "cos")]
-        return tuple(Param.of_joint(joint, "rad", self.sigma, wave) for joint, wave in each)
-
-    def basis(self, view: View) -> np.ndarray:
-        turning = [j for j, unit in enumerate(_units(view.rig).values()) if unit == "rad"]
-        basis = np.zeros((*view.joints.shape, 2 * len(turning)))
-        for p, j in enumerate(turning):
-            turn = self.shape * view.joints[:, j]
-            basis[:, j, 2 * p], basis[:, j, 2 * p + 1] = np.sin(turn), np.cos(turn)
-        return basis
-
-
-class ArmGearError(ArmJointEccentricity):
-    """A joint's gear is uneven: the angle errs N times a turn, N the gear's ratio or twice it."""
-
-    name = "arm_gear_error"
-    formula = "q_i = reported_i + a_i * sin(N * reported_i) + b_i * cos(N * reported_i)"
-    typical = "0.1 to 0.5 mrad, size assumed"
-    confounded_with = ("arm_backlash", "arm_joint_eccentricity")
-    source = "harmonic drives: Mechanism and Machine Theory 2021, 104122"
-    sigma = 0.0005
-    shape_name, shape, whole = "ratio", 100.0, True
-
-    def shapes(self, stops: View) -> tuple[float, ...]:
-        """Every low order, as of shafts and teeth, and ratios usual in arms, singly and doubled."""
-        high = (24, 32, 34, 50, 51, 80, 100, 101, 120, 160, 161, 200)
-        return tuple(map(float, (*range(2, 21), *high))) if stops.rig.joint_names else ()
-
-
-class ArmBacklash(Effect):
-    """A joint lies half its play behind the way it came: ``true = reported + h * (+1 or -1)``."""
-
-    name = "arm_backlash"
-    site = Site.JOINTS
-    unit = "rad"
-    formula = "q_i = reported_i + h_i * (sign of joint i's last move)"
-    typical = "0.1 to 1 mrad, size assumed"
-    covariates = ("joints", "time_s")
-    confounded_with = ("arm_joint_lag", "arm_joint_offset", "arm_gear_error")
-    source = "size assumed"
-    column = "moved"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param.of_joint(joint, unit, 0.0005) for joint, unit in _units(rig).items())
-
-    def basis(self, view: View) -> np.ndarray:
-        way = np.stack([view[f"{self.column}.{joint}"] for joint in view.rig.joint_names], axis=1)
-        return way[:, :, None] * np.eye(way.shape[1])
-
-
-class ArmJointLag(ArmBacklash):
-    """A joint is read before it has come to rest. Where it rests is off its reading by a share of
-    the distance that it went.
-
-    The share depends on how long the arm waits before it is read; here each joint has one.
-    """
-
-    name = "arm_joint_lag"
-    unit = "1"
-    formula = "q_i = reported_i + k_i * (how far joint i went since the stop before)"
-    typical = "0.01 to 0.2 percent of the distance, size assumed"
-    confounded_with = ("arm_backlash", "arm_joint_scale")
-    column = "travel"
-
-    def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param.of_joint(joint, "1", 0.0005) for joint in rig.joint_names)
-
-
 class ArmJointThermal(ArmJointOffset):
     """A joint's zero goes with the temperature. Gear and housing grow unlike each other."""
 
@@ -368,9 +264,3 @@ class ArmThermalGrowth(Effect):
             origin_m = T_parent_child[:3, :3].T @ T_parent_child[:3, 3]
             basis[:, e, 3:, 0] = warmer[:, None] * origin_m
         return basis
-
-
-def _units(rig: Rig) -> dict[str, str]:
-    """The unit of every joint, by its name."""
-    units = {"revolute": "rad", "prismatic": "m"}
-    return {j: units[kind] for j, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)}

@@ -12,7 +12,6 @@ from calib.rig.columns import PAYLOAD, recorded_columns, stop_columns
 from chains.errors import InputError, NoColumnError
 
 MEASURED_POSES = 20  # by which it is seen whether an effect feels a payload; a choice
-UP = "up"  # (K, 3) in the root's frame, where levels tell it
 
 
 def loads_felt(source: Source, effects: Iterable[Effect]) -> dict[str, str]:
@@ -46,9 +45,9 @@ def pose_columns(
     rig, count = source.rig, len(joints)
     times = np.full(count, np.nan) if time_s is None else time_s
     columns = {**stop_columns(rig, joints, times, given), **recorded_columns(given)}
-    if UP in source.columns and UP not in columns:
-        up = np.mean(source.columns[UP], axis=0)
-        columns[UP] = np.broadcast_to(up / np.linalg.norm(up), (count, 3))
+    if "up" in source.columns and "up" not in columns:
+        up = np.mean(source.columns["up"], axis=0)
+        columns["up"] = np.broadcast_to(up / np.linalg.norm(up), (count, 3))
     for load, effect in felt.items():
         if load not in columns:
             raise InputError(

@@ -1,4 +1,5 @@
-"""A rail that is bent is named as that: an arc of a circle, not drawn as the model has it."""
+"""What is wrong with linear joints is named as that, in worlds that are not drawn as the model is:
+a rail that is an arc of a circle, a screw that is uneven."""
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from ..bench.arm_worlds_hidden import places, tool
 from . import arm_worlds
 
 BENT = 3.6e-4  # 1/m: a beam of 3 m that sags by 0.4 mm
+UNEVEN_M = 2e-4
 POSES = 150
 
 
@@ -59,3 +61,29 @@ def test_it_is_named_alone_and_sized(tmp_path, arm):
     rest = np.abs(effect.estimate[~np.array(mine)] / effect.sigma[~np.array(mine)])
     assert rest.max() < 4
     assert diagnose(after).verdict == "adequate"
+
+
+@pytest.mark.parametrize("lead", [0.02, 0.4])
+def test_an_uneven_screw_is_named_and_its_lead_found(tmp_path, lead):
+    """That of a screw to buy, and one that no list has. It was told as a joint that scatters."""
+    rng, folder = np.random.default_rng(4), tmp_path / "rec"
+    world = arm_worlds.bent(folder, "gantry", rng)
+    read = world.draw(rng, POSES)
+    joint = next(e.joint.name for e in world.edges if e.joint and e.joint.kind == "prismatic")
+    true = read.copy()
+    true[:, world.joints.index(joint)] += UNEVEN_M * np.sin(
+        2 * np.pi * read[:, world.joints.index(joint)] / lead + 0.7
+    )
+    truth = tool(world, places(world, true)[-1]) * arm_worlds.exp(arm_worlds.noise(rng, POSES))
+    arm_worlds.save(folder, world, read, truth, {}, 2e-5)
+    run = calibrate([folder], tmp_path / "run")
+    found = diagnose(run)
+    (name,) = [c["add"] for c in found.candidates if c["step"]]
+    family, _, length = name.partition("@")
+    turns_off = np.ptp(read[:, world.joints.index(joint)]) * abs(1 / float(length) - 1 / lead)
+    assert family == "arm_screw_error" and turns_off < 0.1
+    effect = add(run, [name], tmp_path / "after").solution.shared.effects[name]
+    mine = np.array([n.startswith(f"{joint}.") for n in effect.names])
+    size, sigma = np.hypot(*effect.estimate[mine]), effect.sigma[mine].max()
+    assert size == pytest.approx(UNEVEN_M, abs=4 * sigma) and sigma < UNEVEN_M / 5
+    assert np.abs(effect.estimate[~mine] / effect.sigma[~mine]).max() < 4

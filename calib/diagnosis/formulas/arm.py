@@ -29,12 +29,13 @@ ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose 
 
 
 def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
-    """Each revolute joint that the trackers see, and its table in rad: `residual_m` is how much
-    further it is turned than it says, `sigma_m` how well one pose tells. Poses at which nobody read
-    the joint are not among them."""
+    """Each joint that the trackers see, and its table, in rad, or in m of a linear one:
+    `residual_m` is how much further it is moved than it says, `sigma_m` how well one pose tells.
+    Poses at which nobody read the joint are not among them."""
     rig = stand.sources[0].rig
-    kinds = zip(rig.joint_names, rig.joint_kinds, strict=True)
-    levers = [_lever(i, name) for i, (name, kind) in enumerate(kinds) if kind == "revolute"]
+    units = ("rad" if kind == "revolute" else "m" for kind in rig.joint_kinds)
+    unit = dict(zip(rig.joint_names, units, strict=True))
+    levers = [_lever(i, *each) for i, each in enumerate(unit.items())]
     wide, values = beside(
         stand.problem_of(stand.model.plus(tuple(effect for _, effect in levers))), stand.estimate
     )
@@ -53,7 +54,8 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
         lever = np.where(_unread(stand, layout, joint)[of_rows[1]], 0.0, A[:, columns].sum(axis=1))
         if found := _table(A[:, model], lever, *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
-            yield joint, replace(found, weight_m2=weight, joints=frozenset(rig.joint_names))
+            turning = frozenset(name for name in unit if unit[name] == "rad")
+            yield joint, replace(found, weight_m2=weight, joints=turning, unit=unit[joint])
 
 
 def _unread(stand: Stand, layout: Layout, joint: str) -> np.ndarray:
@@ -96,12 +98,12 @@ def _without_own(
     return right[left, :-1], right[left, -1], stop[left], place[left]
 
 
-def _lever(number: int, joint: str) -> tuple[str, FormulaEffect]:
-    """A joint turned by a constant angle."""
+def _lever(number: int, joint: str, unit: str) -> tuple[str, FormulaEffect]:
+    """A joint moved by a constant amount."""
     document = {
-        "name": f"turned_{number}",
+        "name": f"moved_{number}",
         "site": f"joint:{joint}",
-        "unit": "rad",
+        "unit": unit,
         "sigma": 1.0,
         "basis": "1",
     }
@@ -152,7 +154,6 @@ def _table(
         others_b=full[rest, -1],
         others_stop=stop[rest],
         others_place=place[rest],
-        unit="rad",
     )
 
 

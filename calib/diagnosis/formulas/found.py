@@ -81,12 +81,13 @@ class Formula:
     """What the ranges, or a joint, do, over some covariates, beyond the model.
 
     Args:
-        parts: its terms; amounts are in m, or in rad of a joint.
+        parts: its terms.
         steps: how each of them was found.
         rms_m: of what it changes the residuals by, beyond what the model absorbs.
         seen: covariate -> its least and largest value.
         picture: of residuals over two of the covariates, as measured, as the formula has them and
             what is left; see `picture_of`.
+        unit: of its amounts: m of a range or of a linear joint, rad of another.
         site: what it changes, as a file of formulas has it.
         joints: which covariates are joints of the arm.
     """
@@ -96,6 +97,7 @@ class Formula:
     rms_m: float
     seen: dict[str, tuple[float, float]]
     picture: dict[str, Any]
+    unit: str = "m"
     site: str = RANGE_SITE
     joints: frozenset[str] = frozenset()
 
@@ -134,11 +136,6 @@ class Formula:
             else f"{self.site.removeprefix(JOINT_SITE)} = read"
         )
         return " ".join([what, *(_said(part, AMOUNT_UNITS[self.unit]) for part in self.parts)])
-
-    @property
-    def unit(self) -> str:
-        """Of its amounts."""
-        return "m" if self.site == RANGE_SITE else "rad"
 
     def name(self, taken: Collection[str] = ()) -> str:
         """Of its effect; another where that is taken."""
@@ -243,6 +240,7 @@ def _grouped(
                 rms_m=float(np.sqrt(model.weight @ np.square(left) / model.weight_m2)),
                 seen={n: _ends(table.covariates[n]) for n in names},
                 picture=picture_of(table, names, value, fit, AMOUNT_UNITS[table.unit]),
+                unit=table.unit,
                 joints=table.joints & set(names),
             )
         )

@@ -1,0 +1,150 @@
+"""How what drives and reads an arm's joints errs: encoders, gears, screws, play."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.effects.base import Effect, Param, Site, View
+from calib.effects.basis import joint_units
+from calib.rig import Rig
+
+
+class ArmJointScale(Effect):
+    """An encoder counts too many steps a turn: ``true joint = reported * (1 + k)``."""
+
+    name = "arm_joint_scale"
+    site = Site.JOINTS
+    unit = "1"
+    formula = "q_i = reported_i + k_i * reported_i"
+    typical = "up to 0.1 percent, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_offset", "arm_joint_eccentricity")
+    source = "size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param.of_joint(joint, "1", 0.001) for joint in rig.joint_names)
+
+    def basis(self, view: View) -> np.ndarray:
+        return view.joints[:, :, None] * np.eye(view.joints.shape[1])
+
+
+class ArmJointEccentricity(Effect):
+    """A joint's encoder disc sits off its axis: the angle errs once a turn."""
+
+    name = "arm_joint_eccentricity"
+    joint_kind = "revolute"
+    site = Site.JOINTS
+    unit = "rad"
+    formula = "q_i = reported_i + a_i * sin(reported_i) + b_i * cos(reported_i)"
+    typical = "0.1 to 1 mrad, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_joint_scale")
+    source = "Judd and Knasinski 1990, IEEE Trans. Robotics and Automation 6(1)"
+    sigma = 0.001
+    shape = 1.0
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        mine = [joint for joint, unit in joint_units(rig).items() if unit == self.unit]
+        each = [(joint, wave) for joint in mine for wave in ("sin", "cos")]
+        return tuple(Param.of_joint(joint, self.unit, self.sigma, wave) for joint, wave in each)
+
+    def basis(self, view: View) -> np.ndarray:
+        mine = [j for j, unit in enumerate(joint_units(view.rig).values()) if unit == self.unit]
+        basis = np.zeros((*view.joints.shape, 2 * len(mine)))
+        for p, j in enumerate(mine):
+            turn = self.turn(view.joints[:, j])
+            basis[:, j, 2 * p], basis[:, j, 2 * p + 1] = np.sin(turn), np.cos(turn)
+        return basis
+
+    def turn(self, joint: np.ndarray) -> np.ndarray:
+        """How far what is uneven has turned, rad, where a joint is."""
+        return self.shape * joint
+
+
+class ArmGearError(ArmJointEccentricity):
+    """A joint's gear is uneven: the angle errs N times a turn, N the gear's ratio or twice it."""
+
+    name = "arm_gear_error"
+    formula = "q_i = reported_i + a_i * sin(N * reported_i) + b_i * cos(N * reported_i)"
+    typical = "0.1 to 0.5 mrad, size assumed"
+    confounded_with = ("arm_backlash", "arm_joint_eccentricity")
+    source = "harmonic drives: Mechanism and Machine Theory 2021, 104122"
+    sigma = 0.0005
+    shape_name, shape, whole = "ratio", 100.0, True
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Every low order, as of shafts and teeth, and ratios usual in arms, singly and doubled."""
+        high = (24, 32, 34, 50, 51, 80, 100, 101, 120, 160, 161, 200)
+        return tuple(map(float, (*range(2, 21), *high))) if stops.rig.joint_names else ()
+
+
+class ArmScrewError(ArmJointEccentricity):
+    """What drives a linear joint is uneven: the travel errs once in each lead of a screw, tooth of
+    a rack or turn of a pinion."""
+
+    name = "arm_screw_error"
+    joint_kind = "prismatic"
+    unit = "m"
+    formula = "q_i = reported_i + a_i * sin(w) + b_i * cos(w), w = 2 pi * reported_i / L"
+    typical = "0.005 to 0.1 mm, size assumed"
+    confounded_with = ("arm_joint_scale", "arm_backlash")
+    source = "leads: ISO 3408-2; size assumed"
+    sigma = 0.00005
+    shape_name, shape = "lead", 0.01
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Usual leads in mm and inches, and teeth by their module; and longer, half a period after
+        the other over the travel, down to a 20th of it."""
+        if not self.params(stops.rig):
+            return ()
+        linear = np.array([kind == "prismatic" for kind in stops.rig.joint_kinds])
+        travel_mm = 1e3 * np.ptp(stops.joints[:, linear], axis=0).max()
+        mm = [1, 2, 2.5, 3, 4, 5, 6, 8, 10, 12, 16, 20, 25, 32, 40]
+        mm += [25.4 * inch for inch in (0.2, 0.25, 0.5, 1)]
+        mm += [np.pi * module for module in (1, 1.5, 2, 3, 4)]
+        mm += [each for k in range(3, 41) if (each := 2 * travel_mm / k) > max(mm)]
+        return tuple(round(1e-3 * each, 8) for each in sorted(mm))
+
+    def turn(self, joint: np.ndarray) -> np.ndarray:
+        return 2 * np.pi * joint / self.shape
+
+
+class ArmBacklash(Effect):
+    """A joint lies half its play behind the way it came: ``true = reported + h * (+1 or -1)``."""
+
+    name = "arm_backlash"
+    site = Site.JOINTS
+    unit = "rad"
+    formula = "q_i = reported_i + h_i * (sign of joint i's last move)"
+    typical = "0.1 to 1 mrad, size assumed"
+    covariates = ("joints", "time_s")
+    confounded_with = ("arm_joint_lag", "arm_joint_offset", "arm_gear_error")
+    source = "size assumed"
+    column = "moved"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(
+            Param.of_joint(joint, unit, 0.0005) for joint, unit in joint_units(rig).items()
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        way = np.stack([view[f"{self.column}.{joint}"] for joint in view.rig.joint_names], axis=1)
+        return way[:, :, None] * np.eye(way.shape[1])
+
+
+class ArmJointLag(ArmBacklash):
+    """A joint is read before it has come to rest. Where it rests is off its reading by a share of
+    the distance that it went.
+
+    The share depends on how long the arm waits before it is read; here each joint has one.
+    """
+
+    name = "arm_joint_lag"
+    unit = "1"
+    formula = "q_i = reported_i + k_i * (how far joint i went since the stop before)"
+    typical = "0.01 to 0.2 percent of the distance, size assumed"
+    confounded_with = ("arm_backlash", "arm_joint_scale")
+    column = "travel"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(Param.of_joint(joint, "1", 0.0005) for joint in rig.joint_names)
