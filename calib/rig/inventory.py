@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig import Rig
-from calib.rig.columns import PAYLOAD
+from calib.rig.columns import PAYLOAD, up_in_root
 from calib.rig.suspect import listed
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
@@ -257,8 +257,15 @@ def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
             )
 
 
-def odd_levels(recording: RecordedStops) -> Iterator[str]:
-    """Columns as an accelerometer writes them, of which rig.yaml says nothing."""
+def odd_levels(rig: Rig, recording: RecordedStops) -> Iterator[str]:
+    """Levels that say the rig hangs head down, and columns as an accelerometer writes them, of
+    which rig.yaml says nothing."""
+    if rig.levels and up_in_root(rig, recording).mean(axis=0)[2] < 0.0:
+        yield (
+            f"levels say that z of '{rig.tree.root}' points down; at rest they are to read 1 g "
+            "along what points up. Does the rig hang from a ceiling? Else turn the signs of .ax, "
+            ".ay and .az"
+        )
     for frame in undeclared_levels(recording.covariates):
         yield (
             f"stops.csv has {', '.join(level_columns(frame))}, as of an accelerometer in {frame}, "

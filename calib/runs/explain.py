@@ -11,6 +11,7 @@ from typing import Any
 from calib import outputs
 from calib.blunders import told
 from calib.diagnosis import Diagnosis
+from calib.diagnosis.verdict.sentences import rival_sentence
 from calib.effects import Effect, is_known, load_effects, own_effects, read, trust_in
 from calib.problem.model import Model, Source
 from calib.results.errors import judged_mm, tells_of_poses
@@ -38,10 +39,12 @@ class Explanation:
 
     Args:
         runs: from the first fit to the last, each grown from the one before.
-        steps: per run what was added, dropped or left out, and its held-out error.
+        steps: per run what was added, dropped or left out, and its held-out error; and, of what was
+            added, the `rivals` of `Diagnosis.candidates` that explain as much, by its name.
         refused: effects that were found, and rivals of such, that did not lower the held-out error.
         diagnosis: of the last run.
         kept: files of the formulas that the last run has, for other recordings to use.
+        untold: what the last run has, though something else explains as much; a sentence each.
     """
 
     runs: Sequence[Run]
@@ -49,12 +52,13 @@ class Explanation:
     refused: Sequence[str]
     diagnosis: Diagnosis
     kept: Sequence[Path] = ()
+    untold: Sequence[str] = ()
 
     def document(self) -> dict[str, Any]:
         """As written to explanation.json."""
         return {
             "verdict": self.diagnosis.verdict,
-            "sentences": list(self.diagnosis.sentences),
+            "sentences": [*self.diagnosis.sentences, *self.untold],
             "ladder": list(self.steps),
             "refused": list(self.refused),
             "kept": [str(path) for path in self.kept],
@@ -98,7 +102,9 @@ def explain(
         climb.clear_above()
         kept = _keep_formulas(climb.run, entries)
         files = [out / KEPT_EFFECTS / path.name for path in kept]
-        result = Explanation(climb.runs, climb.steps, climb.refused, diagnosis, kept=files)
+        result = Explanation(
+            climb.runs, climb.steps, climb.refused, diagnosis, kept=files, untold=climb.untold()
+        )
         write_json(entries / EXPLANATION, result.document())
         if not kept and (out / KEPT_EFFECTS).is_dir():
             outputs.remove(out / KEPT_EFFECTS)
@@ -139,6 +145,7 @@ class _Climb:
         self.refused: list[str] = []
         self._formulas: Mapping[str, Mapping[str, Any]] = {}
         self._general: set[str] = set()  # effects that have a more general rival
+        self._rivals: Mapping[str, Sequence[Mapping[str, Any]]] = {}
 
     @property
     def run(self) -> Run:
@@ -186,15 +193,15 @@ class _Climb:
             for each in diagnosis.candidates
             if any(rival["dof"] > each["dof"] for rival in each["rivals"])
         }
-        rivals = {c["add"]: [r["add"] for r in c["rivals"]] for c in diagnosis.candidates}
+        self._rivals = {each["add"]: each["rivals"] for each in diagnosis.candidates}
         names = [*diagnosis.worth_adding, *self._formulas]
         earlier = [name for step in self.steps for name in step["added"]]
         before = len(self.runs)
         for name in names:
             if self._add(name):
                 continue
-            for rival in rivals.get(name, []):  # in its place, if stops bear that out
-                if self._add(rival, instead=True):
+            for rival in self._rivals.get(name, []):  # in its place, if stops bear that out
+                if self._add(rival["add"], instead=True):
                     break
         if len(self.runs) == before:
             return False
@@ -228,6 +235,18 @@ class _Climb:
         folder, model = self._next(), self._model.leaving_out(tokens)
         run = self._finished(folder, model, self.run) or grow(self.run, model, folder, self.tell)
         self._keep(run, [], [], tokens)
+
+    def untold(self) -> list[str]:
+        """What was added, and is there at last, though something that is not there explains as
+        much; a sentence each."""
+        names, families = ({getattr(e, k) for e in self._model.effects} for k in ("name", "family"))
+        return [
+            f"{name} was added. {rival_sentence(rival)}"
+            for step in self.steps
+            for name, rivals in step["rivals"].items()
+            for rival in rivals
+            if name in names and rival["effect"] not in families
+        ]
 
     @property
     def _model(self) -> Model:
@@ -264,6 +283,7 @@ class _Climb:
                 "empirical": [name for name in added if name in self._formulas],
                 "dropped": dropped,
                 "left_out": list(left_out),
+                "rivals": {name: list(self._rivals.get(name, ())) for name in added},
                 "held_out_rms_mm": rms["held_out"],
                 "fit_rms_mm": rms["fit"],
                 "noise_floor_mm": rms["noise_floor"],

@@ -92,6 +92,8 @@ def print_explanation(explanation: Explanation) -> None:
         console.print(f"Kept for other recordings ('rigcal fit --effects'): {path}")
     console.print()
     _say_found(console, explanation.diagnosis, explanation.refused)
+    for sentence in explanation.untold:
+        console.print(sentence)
     last = runs[-1].summary
     kind = "held_out" if last["rms_mm"].get("held_out") is not None else "fit"
     what = {"held_out": "held-out error", "fit": "error of the fit, none held out"}[kind]

@@ -135,7 +135,7 @@ def test_a_later_one_with_a_more_general_rival_must_help_at_most_stops(climbed, 
     each = {of(A): [5.0, 5.0, 5.0, 5.0]}
     each[of(A, B)] = [4.0, 4.1, 3.9, 4.0] if steady else [5.2, 5.1, 5.2, 0.0]
     errors = {of(): 9.0, of(A): 5.0, of(A, B): 4.0, of(B): 8.0}
-    judged = {B: {"dof": 2, "rivals": [{"add": A, "dof": 4 if general else 2}]}}
+    judged = {B: {"dof": 2, "rivals": [{"add": A, "effect": A, "dof": 4 if general else 2}]}}
     found = climbed(World(errors, {of(): [A], of(A): [B]}, (), judged, each))
     assert [s["added"] for s in found.steps][1:] == (
         [[A]] if general and not steady else [[A], [B]]
@@ -144,10 +144,25 @@ def test_a_later_one_with_a_more_general_rival_must_help_at_most_stops(climbed, 
 
 
 def test_where_a_name_is_refused_what_nothing_told_it_apart_from_is_tried(climbed):
-    judged = {A: {"dof": 1, "rivals": [{"add": B, "dof": 1}, {"add": C, "dof": 1}]}}
+    judged = {A: {"dof": 1, "rivals": [{"add": n, "effect": n, "dof": 1} for n in (B, C)]}}
     errors = {of(): 9.0, of(A): 9.5, of(B): 5.0, of(C): 4.0}
     found = climbed(World(errors, {of(): [A], of(B): []}, (), judged))
     assert [s["added"] for s in found.steps] == [[], [B]] and found.refused == [A]
+
+
+def test_what_was_added_in_place_of_nothing_that_was_told_from_it_is_said_to_the_end(climbed):
+    """Not of a rival that came into the model too, nor once what was added has gone again."""
+    told = {"dof": 1, "odds": 2.0, "separate": "a longer walk"}
+    rivals = [{"add": name, "effect": name, **told} for name in (B, C)]
+    judged = {A: {"dof": 1, "rivals": rivals}}
+    errors = {of(): 9.0, of(A): 5.0, of(A, B): 4.0, of(B): 8.0}
+    found = climbed(World(errors, {of(): [A], of(A): [B]}, (), judged))
+    (said,) = found.untold
+    assert said.startswith(f"{A} was added. On these data it is not distinguishable from {C} ")
+    assert found.document()["sentences"][-1] == said
+    dropped = World(errors | {of(B): 3.0}, {of(): [A], of(A): [B]}, (), judged)
+    shutil.rmtree(found.runs[0].folder.parent)
+    assert climbed(dropped).untold == []
 
 
 @pytest.mark.parametrize("last", [[B], []], ids=["refused", "calm"])

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from scipy.stats import chi2
@@ -20,6 +21,7 @@ from calib.report import report
 from calib.residuals.levels import Level
 from calib.results.check import check
 from calib.rig.columns import up_in_root
+from calib.runs.belief import cautions
 from calib.runs.run import RESIDUALS
 from calib.show.tables import print_run
 from calib.simulation import PRESETS, Spec, simulate
@@ -134,6 +136,20 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("levels") / "rec"
     simulate(spec(), folder, seed=1)
     return folder
+
+
+def test_levels_that_point_down_are_told(recording, tmp_path):
+    """As those do that say where gravity pulls; the arm then seems to give way upwards."""
+    shutil.copytree(recording, tmp_path / "rec")
+    table = pd.read_csv(tmp_path / "rec" / "stops.csv")
+    felt = [f"{frame}.{axis}" for frame in FRAMES for axis in ("ax", "ay", "az")]
+    table[felt] = -table[felt]
+    table.to_csv(tmp_path / "rec" / "stops.csv", index=False)
+    for folder, wrong in ((recording, False), (tmp_path / "rec", True)):
+        told = check(folder, graph=False).odd
+        assert any("levels say that z of" in str(each) for each in told) == wrong
+    found = calib.fit(tmp_path / "rec", tmp_path / "run", hold_out="none")
+    assert [each for each in cautions(found) if "up points down in 'opti'" in each]
 
 
 @pytest.fixture(scope="module")
