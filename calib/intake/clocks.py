@@ -8,6 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.intake.jumps import Jump, jump_of
+from calib.intake.likeness import (
+    LEAST_LIKE,
+    LOBE_S,
+    RIVAL,
+    correlation,
+    evidence_of,
+    likeness_of,
+    vertex,
+)
 from calib.intake.motion import Motion, motions
 from chains.errors import InputError
 from chains.frames import Edge
@@ -16,15 +26,12 @@ from sensors.documents import nearest
 from sensors.readers.base import Sweeps, Track
 
 RATE_WINDOW_S = 0.2  # rates are smoothed over it before they are compared
-LEAST_LIKE = 0.75  # correlation below which two motions are not the same
-RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which is right
-LOBE_S = 1.0  # within it of the best, a peak is the same one
-LEAST_OVERLAP = 0.3  # of the shorter log
 LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
 REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off needs 40 min for it
 LEAST_S = 2.0  # of a log: less has not one move of an arm in it
 # From the first part to the last; less is below the time that an arm takes to settle.
 DRIFT_S = 0.02
+WHOLLY_LIKE = 0.98  # where motions are alike by more, no clock was set: it would tear them apart
 FINEST = 1 / 20  # of a step: no more is believed of a parabola
 # The sigma of what is added, of how far off left-out offsets are predicted. These err by themselves
 # and by the mean of two others, 1 + 1/2 variances; a time between two of them by 2/3 on average.
@@ -69,6 +76,7 @@ class Offset:
         added: what is to be added, its change included.
         drift_s: by how much the offset changes from the first part of the logs to the last; 0 where
             it merely scatters.
+        jump_at_s: when the clock was set, by its own times; None where it was not.
     """
 
     offset_s: float
@@ -76,6 +84,7 @@ class Offset:
     likeness: float
     added: Added
     drift_s: float = 0.0
+    jump_at_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -180,7 +189,13 @@ def _offset(
         f"clocks: {clock} {best.offset_s:+.4f} ± {best.sigma_s:.4f} s, from the motion of "
         f"{a.name} and {b.name} (correlation {best.likeness:.2f})"
     )
-    if len(best.added.at_s) > 1:
+    if best.jump_at_s is not None:
+        before_s, after_s = best.added.offset_s[[0, -1]]
+        out.odd.append(
+            f"clock {clock} was set at {best.jump_at_s:.1f} s, or the other was: what is added to "
+            f"its times is {before_s:+.3f} s before that and {after_s:+.3f} s from then on"
+        )
+    elif len(best.added.at_s) > 1:
         shape = "a straight line" if len(best.added.at_s) == 2 else "straight pieces"
         out.odd.append(
             f"clock {clock} drifts by {best.drift_s:+.3f} s from the beginning to the end; its "
@@ -231,17 +246,19 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     a, b = (_grid(motion, step_s) for motion in (mine, other))
     if min(np.nanstd(a), np.nanstd(b)) < 1e-3 or min(len(a), len(b)) * step_s < LEAST_S:
         return None
-    lag, likeness, count = _likeness(a, b)
+    lag, likeness, count = likeness_of(a, b)
     if not np.isfinite(likeness).any():
         return None
-    evidence = -count * np.log1p(-(np.clip(likeness, 0, 0.9999) ** 2))
+    evidence = evidence_of(likeness, count)
     best = int(np.nanargmax(evidence))
-    peak_s = (lag[best] + _vertex(likeness, best)) * step_s
+    peak_s = (lag[best] + vertex(likeness, best)) * step_s
     far = np.abs(lag - lag[best]) * step_s > LOBE_S
     rival = np.nanmax(evidence, where=far & np.isfinite(evidence), initial=0.0)
     offset_s = float(other.time_s[0] - mine.time_s[0] + peak_s)
     top = float(likeness[best])
     always = Added.always(offset_s)
+    if top < WHOLLY_LIKE and (jump := jump_of(a, b, step_s)) and jump.likeness > top:
+        return _jumped(mine, float(other.time_s[0] - mine.time_s[0]), jump, step_s)
     if rival > RIVAL * evidence[best] and top > LEAST_LIKE:
         return Offset(offset_s, np.nan, top, added=always)
     at, shift_s = _parts(a, b, int(lag[best]), step_s)
@@ -252,6 +269,28 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     added, missed_s = _pieces(mine.time_s[0] + at * step_s, ahead_s + shift_s)
     sigma_s = max(PREDICTED * float(np.sqrt(np.mean(np.square(missed_s)))), FINEST * step_s)
     return Offset(offset_s, sigma_s, top, added=added, drift_s=drift_s)
+
+
+def _jumped(mine: Motion, ahead_s: float, jump: Jump, step_s: float) -> Offset:
+    """What is added to the times of `mine` where a clock was set; `ahead_s` is by how much the
+    other log begins later."""
+    before_s, after_s = (ahead_s + lag * step_s for lag in jump.lags)
+    low_s, high_s = (mine.time_s[0] + k * step_s for k in jump.at)
+    some = np.flatnonzero((mine.time_s >= low_s) & (mine.time_s <= high_s))
+    gaps = np.diff(mine.time_s[some])
+    at_s = (low_s + high_s) / 2
+    if len(gaps) and gaps.max() > abs(after_s - before_s) / 2:  # its own times tell when
+        at_s = float(mine.time_s[some[np.argmax(gaps)]] + gaps.max() / 2)
+    return Offset(
+        offset_s=float(before_s),
+        sigma_s=max(float(jump.spread) * step_s, FINEST * step_s),
+        likeness=jump.likeness,
+        added=Added(
+            np.array([before_s, before_s, after_s, after_s]),
+            np.array([mine.time_s[0], at_s, np.nextafter(at_s, np.inf), mine.time_s[-1]]),
+        ),
+        jump_at_s=at_s,
+    )
 
 
 def _step(motion: Motion) -> float:
@@ -269,43 +308,6 @@ def _grid(motion: Motion, step_s: float) -> Array:
     after = np.clip(np.searchsorted(time_s[known], at), 1, known.sum() - 1)
     grid[np.diff(time_s[known])[after - 1] > 0.5] = np.nan
     return grid
-
-
-def _likeness(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Lags (L,) in steps, the correlation (L,) of a(k) with b(k + lag), and how many samples of
-    both are known there.
-
-    Padfield, Masked object registration in the Fourier domain, IEEE TIP 21 (2012).
-    """
-    size = len(a) + len(b) - 1
-    n = 1 << (size - 1).bit_length()
-    known = [np.isfinite(x).astype(float) for x in (a, b)]
-    values = [np.where(np.isfinite(x), x - np.nanmean(x), 0.0) for x in (a, b)]
-    A, AA, M = (np.conj(np.fft.rfft(x, n)) for x in (values[0], values[0] ** 2, known[0]))
-    B, BB, N = (np.fft.rfft(x, n) for x in (values[1], values[1] ** 2, known[1]))
-    lags = np.arange(-(len(a) - 1), len(b))
-    count, ab, sa, sb, saa, sbb = (
-        np.fft.irfft(x, n)[lags] for x in (M * N, A * B, A * N, M * B, AA * N, M * BB)
-    )
-    least = LEAST_OVERLAP * min(known[0].sum(), known[1].sum())
-    enough = count > max(least, 3)
-    count = np.maximum(count, 1)
-    spread_a = np.maximum(saa - sa**2 / count, 0)
-    spread_b = np.maximum(sbb - sb**2 / count, 0)
-    # An overlap in which one of them stands still says nothing, however alike the rest is.
-    enough &= (spread_a > 0.1 * spread_a.max()) & (spread_b > 0.1 * spread_b.max())
-    with np.errstate(invalid="ignore", divide="ignore"):
-        likeness = (ab - sa * sb / count) / np.sqrt(spread_a * spread_b)
-    return lags, np.where(enough, likeness, np.nan), count
-
-
-def _vertex(values: Array, k: int) -> float:
-    """Where a parabola through a peak and its neighbours has its top, in steps from the peak."""
-    if not 0 < k < len(values) - 1 or not np.isfinite(values[k - 1 : k + 2]).all():
-        return 0.0
-    before, at, after = values[k - 1 : k + 2]
-    curve = before - 2 * at + after
-    return 0.0 if curve >= 0 else float(np.clip((before - after) / (2 * curve), -1, 1))
 
 
 def _parts(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
@@ -348,12 +350,12 @@ def _own_lag(
     if (high - low) * step_s < LEAST_S / 2:
         return np.nan
     shifts = np.arange(-reach, reach + 1)
-    like = [_correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
+    like = [correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
     if not np.isfinite(like).all() or max(like) < LEAST_LIKE:
         return np.nan
     k = int(np.argmax(like))
     at_end = k in (0, len(shifts) - 1)
-    return np.nan if at_end else lag + shifts[k] + _vertex(np.array(like), k)
+    return np.nan if at_end else lag + shifts[k] + vertex(np.array(like), k)
 
 
 def _standard_error(shift_s: Array, step_s: float) -> float:
@@ -389,10 +391,3 @@ def _drift(offset_s: Array) -> float:
     left = offset_s - offset_s.mean() - slope * part
     sigma = np.sqrt(left @ left / (len(part) - 2) / (part @ part))
     return slope * (len(part) - 1) if abs(slope) > 4 * sigma else 0.0
-
-
-def _correlation(a: Array, b: Array) -> float:
-    both = np.isfinite(a) & np.isfinite(b)
-    if both.sum() < 3 or a[both].std() < 1e-4 or b[both].std() < 1e-4:
-        return np.nan
-    return float(np.corrcoef(a[both], b[both])[0, 1])

@@ -156,6 +156,47 @@ def test_a_clock_that_keeps_time_is_not_bent(edges):
     assert not said.odd and np.ptp(said.tracks[1].time_s - cup(0.0).time_s) < 1e-9
 
 
+def set_by(track, by_s, at=0.5):
+    """The clock of a track was set so far ahead (n,), at shares of the time (n,)."""
+    at_s = track.time_s[0] + np.atleast_1d(at) * np.ptp(track.time_s)
+    ahead = np.atleast_1d(by_s) * (track.time_s[:, None] >= at_s)
+    return replace(track, time_s=track.time_s + ahead.sum(axis=1))
+
+
+@pytest.mark.parametrize("by_s", [0.6, 2.5, 40.0])
+@pytest.mark.parametrize("whose", ["tracker", "joints"])
+def test_a_clock_that_was_set_is_corrected_before_and_after(edges, by_s, whose):
+    """One offset is right for half of the logs; in between, and elsewhere, none is."""
+    moves = plan(40)
+    mine, seen = joints(moves=moves), cup(3.2, moves=moves)
+    if whose == "tracker":
+        found = align([mine, set_by(seen, by_s)], [], edges, {})
+        expected = seen.time_s + 3.2
+    else:
+        found = align([set_by(mine, by_s), seen], [], edges, {})
+        expected = set_by(replace(seen, time_s=seen.time_s + 3.2), by_s).time_s
+    (said,) = found.odd
+    assert "was set at" in said
+    off_s = np.abs(found.tracks[1].time_s - expected)
+    wrong = off_s > 5e-3  # from the jump to where the arm moves next, at most
+    moving = np.ptp(moves[1], axis=1).sum() / moves[1][-1, 1]
+    assert wrong.mean() < 0.03 and 0 < moving < 1
+    assert off_s[~wrong].max() < 5e-3
+
+
+@pytest.mark.parametrize("at", [(0.3, 0.6), (0.05,)])
+def test_of_a_clock_that_was_set_twice_or_at_the_end_no_wrong_offset_is_believed(edges, at):
+    moves = plan(40)
+    seen = set_by(cup(3.2, moves=moves), [2.5] * len(at), list(at))
+    try:
+        found = align([joints(moves=moves), seen], [], edges, {})
+    except InputError as error:
+        assert "--clock-offset take=SECONDS" in str(error)
+    else:
+        times = seen.time_s if len(at) == 1 else np.nan
+        assert np.median(np.abs(found.tracks[1].time_s - (times + 3.2 - 2.5))) < 0.01
+
+
 def test_motion_that_repeats_is_ambiguous(edges):
     held = np.tile(HELD[:2], (8, 1))
     spans = 5.0 * np.arange(16)[:, None] + [0, 3]
