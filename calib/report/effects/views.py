@@ -62,6 +62,8 @@ def walk_of(effect: Effect, rig: Rig) -> Walk | None:
         return _stops(rig)
     if "elapsed_s" in over:
         return _along(rig, "elapsed_s")
+    if effect.joint_kind == "prismatic":
+        return _slid(effect, rig)
     if over == ["tracked"]:
         return _places(rig, "tracked", "x of a body or marker in the tracker's frame, m", TRACKED)
     if over == ["point_m"]:
@@ -115,6 +117,21 @@ def _along(rig: Rig, name: str) -> Walk:
     joints[:, joint] = column
     return Walk(_view(rig, CURVE_POINTS, joints=joints), label.format(rig.joint_names[joint]),
                 times * column)  # fmt: skip
+
+
+def _slid(effect: Effect, rig: Rig) -> Walk | None:
+    """Along the first linear joint, as far as it goes; of what repeats, ten times."""
+    linear = [i for i, kind in enumerate(rig.joint_kinds) if kind == "prismatic"]
+    if not linear:
+        return None
+    joint = rig.joints[linear[0]]
+    low, high = (end if np.isfinite(end) else usual for end, usual in
+                 ((joint.lower, 0.0), (joint.upper, 1.0)))  # fmt: skip
+    high = min(high, low + 10 * effect.shape) if effect.shape_name else high
+    joints = np.zeros((CURVE_POINTS, len(rig.joint_names)))
+    joints[:, linear[0]] = column = np.linspace(low, high, CURVE_POINTS)
+    label = f"position of {joint.name}, mm"
+    return Walk(_view(rig, CURVE_POINTS, joints=joints), label, 1e3 * column)
 
 
 def _places(
