@@ -239,10 +239,10 @@ def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any
 
 
 def whole(clause: str) -> str:
-    """A clause as a sentence of its own; a name with a dot or the like, with which it begins, is
-    left as it is written."""
+    """A clause, or a question, as a sentence of its own; a name with a dot or the like, with which
+    it begins, is left as it is written."""
     begins = clause[0].upper() if clause.partition(" ")[0].isalpha() else clause[0]
-    return f"{begins}{clause[1:]}."
+    return f"{begins}{clause[1:]}{'' if clause.endswith('?') else '.'}"
 
 
 def uneven(blunders: Iterable[Blunder]) -> list[str]:

@@ -130,6 +130,12 @@ def of_beams(placed: Sequence[PlacedScan]) -> Iterator[Line]:
 # ---------------------------------------------------------------------------------- what looks odd
 
 
+def odd_numbers(rig: Rig, recording: RecordedStops) -> Iterator[str]:
+    """Numbers of stops that are hardly what they are taken for, and that no residual need show."""
+    yield from odd_columns(recording)
+    yield from odd_payloads(rig, recording)
+
+
 def odd_rig(rig: Rig) -> Iterator[str]:
     """Sigmas that look like millimetres."""
     for section in ("tracker", "target", "reference"):

@@ -70,6 +70,7 @@ def cautions(run: Run) -> list[str]:
             f"up points down in '{up['frame']}', as levels have it; at rest they are to read 1 g "
             "along what points up"
         )
+    out += run.summary.get("odd", ())  # which runs of earlier versions lack
     told = [*together_told(run.summary), *standing_out(run.summary)]
     return [*out, *_rings(run, bad=False), *told]
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import special
 
@@ -15,6 +16,9 @@ from calib.runs.diagnose import diagnose, stand_of
 from calib.runs.run import Run
 from calib.show.verdict import judge
 from calib.simulation import simulate
+
+from . import arm_worlds
+from .test_arm_geometry import opened
 
 
 def _of_tips(folder):
@@ -117,3 +121,17 @@ def test_what_asks_for_care_is_told_by_both(run, searched, monkeypatch, summary,
 def test_of_a_sound_run_neither_is_told(run, searched, monkeypatch):
     found = diagnosed(run, searched, monkeypatch)
     assert found.verdict == "adequate" and not forbids(run) and not cautions(run)
+
+
+def test_what_numbers_hardly_are_is_said_of_the_run(tmp_path):
+    """A payload in grams: what gives way to it is found all the same, and a thousandth as soft."""
+    rng = np.random.default_rng(3)
+    opened(tmp_path / "rec", arm_worlds.bent(tmp_path / "rec", "ur10", rng), rng, poses=40)
+    table = pd.read_csv(tmp_path / "rec" / "stops.csv")
+    for kg, wrong in ((2.0, False), (2000.0, True)):
+        table.assign(payload_kg=kg * (np.arange(len(table)) % 3)).to_csv(
+            tmp_path / "rec" / "stops.csv", index=False
+        )
+        run = calibrate([tmp_path / "rec"], tmp_path / f"run{kg}", hold_out="none")
+        said = [each for each in cautions(run) if "payload_kg goes up to 4000" in each]
+        assert bool(said) == wrong
