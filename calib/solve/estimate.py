@@ -90,6 +90,11 @@ class Estimate:
         """Half the weighted chi-square, priors included."""
         return cost_of(self.linear, self.graph, self.values)
 
+    @property
+    def robust_cost(self) -> float:
+        """The same with half the robust chi-square of beams in place of the weighted one."""
+        return rest_of(self.linear, self.graph, self.values, ()) + self.linear.beams_cost
+
     def loosened(self, moved: Mapping[str, float]) -> Estimate:
         """The same estimate, as it is held against CAD where unknowns have moved since that told
         of them; see `Model.moved`."""

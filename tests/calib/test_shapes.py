@@ -3,12 +3,15 @@ against refits with other shapes."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import yaml
 
 from calib import problem as problems
-from calib.effects import CATALOGUE
+from calib.diagnosis.search import shapes
+from calib.effects import CATALOGUE, find
 from calib.linear.linearise import beams_cost
 from calib.problem.model import Model
 from calib.report.calibration import _numbers
@@ -130,3 +133,26 @@ def test_a_shape_at_which_the_basis_jumps_is_not_estimated():
     assert {"warmup_drift", "near_range_bias", "range_cyclic", "mount_settle"} <= smooth
     assert not {"mount_slip", "arm_joint_slip", "range_step", "arm_gear_error"} & smooth
     assert {e.name for e in CATALOGUE if e.jumps} >= {"body_slip", "tracker_slip", "base_slip"}
+
+
+def test_of_places_that_each_seem_better_from_the_other_that_which_costs_less_is_kept(monkeypatch):
+    """Rows between the two err another way than the model has it on either side."""
+    costs = {"mesh_seam_x@0.5": 11.0, "mesh_seam_x@0.6": 10.0}
+    here, there = (find(name) for name in costs)
+
+    def fitted(effect):
+        estimate = SimpleNamespace(linear=True, robust_cost=costs[effect.name])
+        return SimpleNamespace(estimate=estimate, model=SimpleNamespace(effects=(effect,)))
+
+    def better(stand, names, progress):
+        (effect,) = stand.model.effects
+        return {effect.name: there if effect is here else here}
+
+    monkeypatch.setattr(shapes, "_better_shapes", better)
+    monkeypatch.setattr(
+        shapes, "_with_shapes", lambda stand, swapped, progress: fitted(*swapped.values())
+    )
+    for first in (here, there):
+        stand, swapped = shapes.retuned(fitted(first), [first.name], print)
+        assert stand.model.effects == (there,)
+        assert swapped == ({here.name: there} if first is here else {})

@@ -46,9 +46,18 @@ def retuned(
         swapped = _better_shapes(stand, original, progress)
         if not swapped or (further := tried(_with_shapes, stand, swapped, progress)) is None:
             break
+        # Of two places between which rows err another way, each may seem better from the other.
+        jumped = any(effect.jumps for effect in swapped.values())
+        if jumped and _cost(further) >= _cost(stand):
+            break
         stand = further
         found |= {original[name]: effect for name, effect in swapped.items()}
     return stand, found
+
+
+def _cost(stand: Stand) -> float:
+    """What a fit lowers; anything is less where it was resumed, and nothing tells."""
+    return stand.estimate.robust_cost if stand.estimate.linear else np.inf
 
 
 def _with_shapes(stand: Stand, swapped: Mapping[str, Effect], progress: Progress) -> Stand:
