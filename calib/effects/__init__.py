@@ -51,6 +51,7 @@ from calib.effects.drives import (
 from calib.effects.elastic import (
     ArmGravitySag,
     ArmLinkBending,
+    ArmPayloadMoment,
     ArmPayloadOffset,
     ArmPayloadSag,
     ArmTorqueSag,
@@ -137,6 +138,7 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmGravitySag(),
     ArmPayloadSag(),
     ArmPayloadOffset(),
+    ArmPayloadMoment(),
     ArmTorqueSag(),
     ArmLinkBending(),
     ArmBacklash(),

@@ -84,19 +84,22 @@ class ArmPayloadOffset(Effect):
     formula = "q_i = reported_i + o . torque about joint i of the payload, 1 m along each axis"
     typical = "0.2 m at 0.00003 rad/(N m): 0.000006 rad/N, size assumed"
     covariates = ("joints", "payload_kg")
-    confounded_with = ("arm_gravity_sag", "arm_payload_sag", "arm_link_bending")
+    confounded_with = ("arm_gravity_sag", "arm_payload_sag", "arm_payload_moment")
     source = "stiffness of arms: Klimchik et al.; size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        tips = rig.tips if "revolute" in rig.joint_kinds else ()
-        of = {tip: f"{tip}." if len(tips) > 1 else "" for tip in tips}
-        names = (f"{of[tip]}centre_{axis}" for tip in tips for axis in "xyz")
-        return tuple(Param(name, self.unit, 0.2 * SOFT) for name in names)
+        turns = "revolute" in rig.joint_kinds
+        return tuple(Param(n, self.unit, 0.2 * SOFT) for n in self.centres(rig)) if turns else ()
+
+    def centres(self, rig: Rig) -> list[str]:
+        """Where the centre of what each tip carries lies, along the tip's axes."""
+        of = {tip: f"{tip}." if len(rig.tips) > 1 else "" for tip in rig.tips}
+        return [f"{of[tip]}centre_{axis}" for tip in rig.tips for axis in "xyz"]
 
     def basis(self, view: View) -> np.ndarray:
         rig, payloads = view.rig, _payloads(view) or view[PAYLOAD]
         turning = np.array([kind == "revolute" for kind in rig.joint_kinds], float)
-        basis = np.zeros((len(view.joints), len(turning), len(self.params(rig))))
+        basis = np.zeros((len(view.joints), len(turning), len(self.centres(rig))))
 
         def torque(payload: Mass, centre_m: np.ndarray) -> np.ndarray:
             moved = replace(payload, centre_m=centre_m)
@@ -108,6 +111,31 @@ class ArmPayloadOffset(Effect):
             for k, axis in enumerate(np.eye(3)):
                 basis[:, :, first + k] = turning * (torque(payload, axis) - there)
         return basis
+
+
+class ArmPayloadMoment(ArmPayloadOffset):
+    """The payload's centre of mass lies beside the tip, and each joint gives way to the torque of
+    that by a compliance of its own, as wrists are softer than shoulders.
+
+    An amount is the joint's compliance times how far the centre lies from the tip.
+    """
+
+    name = "arm_payload_moment"
+    formula = "q_i = reported_i + o_i . torque about joint i of the payload, 1 m along each axis"
+    confounded_with = ("arm_payload_offset", "arm_gravity_sag", "arm_payload_sag")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(
+            Param.of_joint(rig.joint_names[j], self.unit, 0.2 * SOFT, centre)
+            for j in _turning(rig)
+            for centre in self.centres(rig)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        of_all, mine = super().basis(view), _turning(view.rig)
+        basis = np.zeros((*of_all.shape[:2], len(mine), of_all.shape[2]))
+        basis[:, mine, np.arange(len(mine))] = of_all[:, mine]
+        return basis.reshape(*of_all.shape[:2], -1)
 
 
 class ArmTorqueSag(ArmGravitySag):
@@ -245,6 +273,11 @@ def _payloads(view: View) -> list[Mass]:
         for tip, column in columns.items()
         if column in view.columns
     ]
+
+
+def _turning(rig: Rig) -> list[int]:
+    """Which joints turn."""
+    return [j for j, kind in enumerate(rig.joint_kinds) if kind == "revolute"]
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

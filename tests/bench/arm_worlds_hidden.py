@@ -339,7 +339,9 @@ KINDS: Mapping[str, Kind] = {
     "tracker settle": _kind(tracker_settle, "tracker_settle"),
     "body slip": _kind(body_slip, "body_slip", "mount_slip"),
     "tracker scatter": _kind(tracker_scatter, "tracker_scatter"),
-    "payload offset": _kind(payload_offset, "arm_payload_offset", needs=("payload_kg",)),
+    "payload offset": _kind(
+        payload_offset, "arm_payload_moment", "arm_payload_offset", needs=("payload_kg",)
+    ),
 }
 
 

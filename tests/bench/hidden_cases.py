@@ -74,7 +74,7 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 
 # The range zero is the rings' mean, which is in every model here; and rounding acts on no sensor.
 # What needs columns that these recordings lack is hidden in arms (`arm_effects.py`).
-_OF_LOADS = {"arm_payload_sag", "arm_payload_offset", "arm_torque_sag"}
+_OF_LOADS = {"arm_payload_sag", "arm_payload_offset", "arm_payload_moment", "arm_torque_sag"}
 _NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT, *_OF_LOADS}
 # What is drawn anew by chance at every stop has a bench of its own (`chance.py`).
 SINGLES = tuple(
