@@ -6,6 +6,7 @@ stands in the child's frame, and what is left out has the defaults given there.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 from xml.etree.ElementTree import Element
@@ -135,14 +136,38 @@ def gravity_torque(
     (K, 3) by stop, in the tree's root: a joint that gave way would turn along it.
     """
     torque = np.zeros(np.shape(joints))
-    for mass in masses:
-        chain = SerialChain([tree.edges[i] for i in tree.path(mass.frame)])
+    for end, mine in _by_route(tree, masses).items():
+        chain = _serial(tree, end)
         ours = [tree.joint_names.index(name) for name in chain.joint_names]
-        axes = chain.axes(joints[:, ours])
-        centre_m = axes.T[:, :3, :3] @ mass.centre_m + axes.T[:, :3, 3]
-        rise = np.vecdot(axes.velocities(centre_m), np.atleast_2d(up)[:, None])
-        torque[:, ours] -= G * np.reshape(mass.kg, (-1, 1)) * rise
+        edges = [len(tree.path(mass.frame)) for mass in mine]
+        axes, at_m = chain.axes_and_points(
+            joints[:, ours], edges, np.array([mass.centre_m for mass in mine])
+        )
+        kg = np.stack([np.broadcast_to(mass.kg, len(joints)) for mass in mine], axis=1)
+        before = np.array([chain.behind[edge][0] for edge in edges])
+        beyond = (before[:, None] > np.arange(len(chain.turns))).astype(float)
+        # Of all that lies beyond each axis: how much, and the sum of where, weighed by that.
+        whole, first = kg @ beyond, beyond.T @ (kg[..., None] * at_m)
+        across = np.cross(axes.direction, first - whole[..., None] * axes.at_m)
+        along = np.where(chain.turns[:, None], across, whole[..., None] * axes.direction)
+        torque[:, ours] -= G * np.vecdot(along, np.atleast_2d(up)[:, None]) @ chain.by.T
     return torque
+
+
+def _by_route(tree: FrameTree, masses: Sequence[Mass]) -> dict[str, list[Mass]]:
+    """Return the masses along each of as few chains as lead to all, by the frame at its end."""
+    found: dict[str, list[Mass]] = {}
+    for mass in sorted(masses, key=lambda mass: -len(tree.path(mass.frame))):
+        path = tree.path(mass.frame)
+        end = next((end for end in found if tree.path(end)[: len(path)] == path), mass.frame)
+        found.setdefault(end, []).append(mass)
+    return found
+
+
+@lru_cache(maxsize=32)
+def _serial(tree: FrameTree, frame: str) -> SerialChain:
+    """Return the chain from the root to a frame."""
+    return SerialChain([tree.edges[i] for i in tree.path(frame)])
 
 
 def _chain(robot: Element, base: str, tip: str) -> list[Element]:

@@ -152,74 +152,87 @@ class Arm:
             near: (K, J) joints that bring the tip about there; those found lie next to them.
             columns: as of `corrected`.
         """
-        command, columns = self._checked(near).copy(), columns or {}
-        off = np.empty((len(command), 6))
-        for first in range(0, len(command), CHUNK):
-            some = np.arange(first, min(first + CHUNK, len(command)))
-            self._solve(Ts_base_tip, columns, command, off, some, USUAL_STEPS)
+        near, given = self._checked(near), columns or {}
+        given = {name: np.asarray(column) for name, column in given.items()}
+        command, off = np.empty_like(near), np.empty((len(near), 6))
+
+        def solve(some: np.ndarray, begin: np.ndarray, steps: int) -> None:
+            here = {name: column[some] for name, column in given.items()}
+            command[some], off[some] = self._solve(Ts_base_tip[some], begin[some], here, steps)
+
+        for first in range(0, len(near), CHUNK):
+            solve(np.arange(first, min(first + CHUNK, len(near))), near, USUAL_STEPS)
         far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
-        self._solve(Ts_base_tip, columns, command, off, np.flatnonzero(far), STRETCHED_STEPS)
+        solve(np.flatnonzero(far), command, STRETCHED_STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
         return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
 
     def _solve(
-        self,
-        wanted: np.ndarray,
-        columns: Columns,
-        command: np.ndarray,
-        off: np.ndarray,
-        moving: np.ndarray,
-        steps: int,
-    ) -> None:
-        """Move the commands (K, J) of some poses, and write what is then left, (K, 6) of `_off`."""
-        given = {name: np.asarray(column) for name, column in columns.items()}
-
-        def left(joints: np.ndarray, at: np.ndarray) -> np.ndarray:
-            return self._off(wanted[at], joints, {name: c[at] for name, c in given.items()})
-
-        off[moving], damped = left(command[moving], moving), np.ones(len(command))
+        self, wanted: np.ndarray, near: np.ndarray, columns: Columns, steps: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Commands (K, J) after some steps, and what is then left, (K, 6) of `_off`."""
+        command, damped = near.copy(), np.ones(len(near))
+        off, J = self._off(wanted, command, columns)
+        moving = np.arange(len(near))
         for _ in range(steps):
             far = np.abs(off[moving]).max(axis=1, initial=0.0) > REACHED * self._length_m
             moving = moving[far & (damped[moving] < GIVEN_UP)]
             if not len(moving):
                 break
             tried = command[moving]
-            tried[:, self._ours] += self._step(tried, off[moving], damped[moving])
-            then = left(tried, moving)
+            tried[:, self._ours] += self._step(J[moving], off[moving], damped[moving])
+            here = {name: column[moving] for name, column in columns.items()}
+            then, J_then = self._off(wanted[moving], tried, here)
             nearer = np.linalg.norm(then, axis=1) < np.linalg.norm(off[moving], axis=1)
             times = damped[moving] * np.where(nearer, 0.1, 10.0)
             damped[moving] = np.maximum(times, LEAST_DAMPED)
             better = moving[nearer]
-            command[better], off[better] = tried[nearer], then[nearer]
+            command[better], off[better], J[better] = tried[nearer], then[nearer], J_then[nearer]
+        return command, off
 
-    def _step(self, joints: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
+    def _step(self, J: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
         """How far to turn joints between base and tip (K, n) for tips that are so far off (K, 6),
-        least where more turns do, and shorter the more they are damped (K,)."""
-        J = self._fixed.axes(joints[:, self._ours]).jacobian()
-        J[:, :3] *= self._length_m
+        and move so by them (K, 6, n), least where more turns do, and shorter the more they are
+        damped (K,)."""
         damping = damped * (np.square(off).sum(axis=1) / 2 + DAMPING * self._length_m**2)
         square = J.mT @ J + damping[:, None, None] * np.eye(J.shape[2])
         return np.linalg.solve(square, np.vecmat(off, J)[..., None])[..., 0]
 
-    def _off(self, wanted: np.ndarray, joints: np.ndarray, columns: Columns | None) -> np.ndarray:
+    def _off(
+        self, wanted: np.ndarray, joints: np.ndarray, columns: Columns
+    ) -> tuple[np.ndarray, np.ndarray]:
         """How far (K, 6) tips are from where they are wanted, in the base's axes: rotation times
-        the arm's length, and m."""
-        T = self.corrected(joints, columns)
+        the arm's length, and m; and how they move by the joints between base and tip (K, 6, n),
+        but for what effects change of that."""
+        true, twists = self._bent(joints, columns)
+        axes = self._fixed.axes(true[:, self._ours])
+        T, J = axes.T if twists is None else self._through(true, twists), axes.jacobian()
+        J[:, :3] *= self._length_m
         turn = se3.so3_log(wanted[:, :3, :3] @ T[:, :3, :3].mT)
-        return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]])
+        return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]]), J
 
     def _placed(self, joints: np.ndarray, columns: Columns) -> np.ndarray:
+        true, twists = self._bent(joints, columns)
+        if twists is None:
+            return self._fixed.place(true[:, self._ours])
+        return self._through(true, twists)
+
+    def _bent(self, joints: np.ndarray, columns: Columns) -> tuple[np.ndarray, np.ndarray | None]:
+        """True joints (K, J), and twists (K, E, 6) of edges; None where these never change."""
         asked = pose_columns(self.source, joints, columns, self._felt)
         view = View(self.rig, len(joints), asked, joints)
         for effect, theta in self.effects:
             if effect.site is Site.JOINTS:
                 joints = joints + np.matvec(basis_at(effect, view), theta)
         if not self._varying:
-            return self._fixed.place(joints[:, self._ours])
-        bent = (basis_at(effect, view) @ theta for effect, theta in self._varying)
-        tree, at_rest = self.rig.tree, self._twists[None]
-        T_base = tree.transform(self.base, joints, at_rest)
-        return se3.inverse(T_base) @ tree.transform(self.tip, joints, self._twists + sum(bent))
+            return joints, None
+        return joints, self._twists + sum(basis_at(e, view) @ theta for e, theta in self._varying)
+
+    def _through(self, joints: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        """T_base_tip (K, 4, 4) where edges differ from pose to pose; the base is at rest."""
+        tree = self.rig.tree
+        T_base = tree.transform(self.base, joints, self._twists[None])
+        return se3.inverse(T_base) @ tree.transform(self.tip, joints, twists)
 
     @property
     def rig(self) -> Rig:
