@@ -21,8 +21,11 @@ class NoColumnError(InputError):
     """A recording has not the column that an effect looks at."""
 
     def __init__(self, message: str, column: str) -> None:
-        super().__init__(message)
+        super().__init__(message, column)  # both, so that it can be sent from a worker
         self.column = column
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 LONGEST_NAME = 80  # bytes: tables are called RIG.STOP.parquet, and file systems take 255

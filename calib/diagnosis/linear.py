@@ -92,7 +92,13 @@ class Linear:
     def thinned(self) -> Linear:
         """Without all that only judging needs."""
         return replace(
-            self, raw=None, gradient=self.gradient[:0], others=(), stop=NONE, place=NONE, whole=None
+            self,
+            raw=None,
+            gradient=self.gradient[:0].copy(),
+            others=(),
+            stop=NONE,
+            place=NONE,
+            whole=None,
         )
 
 

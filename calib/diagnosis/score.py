@@ -38,7 +38,7 @@ class Scores:
         score: (Q,).
         information: (Q, Q) left after projection.
         felt: (Q,) of each alone, before it.
-        whole: candidate -> (q, q) of its parameters, before it.
+        whole: candidate -> (q, q) of its parameters, before it; empty of formulas.
         cells: (C, Q) shares of the score, of rows of one stop and one place, by
             residuals as large as errors are (`leverage`).
         stop, place: (C,) the numbers of these, -1 for none.

@@ -95,7 +95,7 @@ class ArmScrewError(ArmJointEccentricity):
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Usual leads in mm and inches, and teeth by their module; and longer, half a period after
         the other over the travel, down to a 20th of it."""
-        if not self.params(stops.rig):
+        if not self.params(stops.rig) or not len(stops.joints):
             return ()
         linear = np.array([kind == "prismatic" for kind in stops.rig.joint_kinds])
         travel_mm = 1e3 * np.ptp(stops.joints[:, linear], axis=0).max()

@@ -135,7 +135,7 @@ class ArmPayloadMoment(ArmPayloadOffset):
         of_all, mine = super().basis(view), _turning(view.rig)
         basis = np.zeros((*of_all.shape[:2], len(mine), of_all.shape[2]))
         basis[:, mine, np.arange(len(mine))] = of_all[:, mine]
-        return basis.reshape(*of_all.shape[:2], -1)
+        return basis.reshape(*of_all.shape[:2], len(mine) * of_all.shape[2])
 
 
 class ArmTorqueSag(ArmGravitySag):

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import FrameOffset
-from calib.evaluation.poses import loads_felt, pose_columns
+from calib.evaluation.poses import loads_felt, pose_columns, to_give
 from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
@@ -125,11 +125,9 @@ def evaluate_at(
     try:
         found = _predicted(run, *told, *read)
     except NoColumnError as error:
-        follows = error.column == "elapsed_s" or error.column.startswith(("travel.", "moved."))
-        wanted = "time_s" if follows else error.column
         raise InputError(
-            f"{poses}: an effect of the model looks at '{error.column}'; add the column {wanted}, "
-            "with a value for each pose"
+            f"{poses}: an effect of the model looks at '{error.column}'; add the column "
+            f"{to_give(error.column)}, with a value for each pose"
         ) from None
     if out is not None:
         if Path(out).suffix != ".csv":

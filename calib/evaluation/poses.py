@@ -67,6 +67,14 @@ def moves(source: Source, effect: Effect, frame: str) -> bool:
     return bool(np.any(basis[:, path]))
 
 
+def to_give(column: str) -> str:
+    """The column of a table of poses from which one follows that effects look at."""
+    if column == "torques":
+        return "<joint>.torque of each joint"
+    follows = column == "elapsed_s" or column.startswith(("travel.", "moved."))
+    return "time_s" if follows else column
+
+
 def basis_at(effect: Effect, view: View) -> np.ndarray:
     """The basis of an effect at poses that were not measured.
 
@@ -78,7 +86,7 @@ def basis_at(effect: Effect, view: View) -> np.ndarray:
     except NoColumnError as error:
         raise InputError(
             f"effect '{effect.name}' looks at column '{error.column}', which was not given of "
-            f"these poses; give it, a value a pose"
+            "these poses; give it, for each of them"
         ) from None
 
 

@@ -12,6 +12,7 @@ from chains.se3 import Array
 
 JUMP_PARTS = 8  # of a log, whose offsets are sought one by one, wherever they may be
 COUNTERPARTS = 0.9  # of a part's samples must have a counterpart
+FEWEST_SAMPLES = 10  # that are known of a part; with fewer any log is like it
 FEWEST_TOLD = 4  # parts that tell their offsets: two before a jump, and two after it
 APART_S = 0.1  # offsets that differ by less are one that drifts
 AS_MUCH_LEFT = 1e-3  # of all that splits differ by: at rest one leaves as much as another
@@ -25,7 +26,7 @@ class Jump:
         lags: (2,) by how many steps the second log is behind, before the jump and after it.
         at: (2,) the last step before it, and the first after it, that tell.
         likeness: correlation of all that has a counterpart, at these offsets.
-        spread: by how many steps the offsets of parts scatter about them, by their mean.
+        spread: standard error of either, in steps, from how those of parts scatter about them.
     """
 
     lags: Array
@@ -40,6 +41,8 @@ def own_lags(a: Array, b: Array, step_s: float) -> tuple[Array, Array]:
     ends = np.linspace(0, len(a), JUMP_PARTS + 1).astype(int)
     first, found = [], []
     for low, high in pairwise(ends.tolist()):
+        if np.isfinite(a[low:high]).sum() < FEWEST_SAMPLES:
+            continue
         lag, like, count = likeness_of(a[low:high], b)
         like = np.where(count > COUNTERPARTS * np.isfinite(a[low:high]).sum(), like, np.nan)
         if not np.isfinite(like).any():

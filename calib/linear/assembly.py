@@ -342,7 +342,7 @@ def add_alone(
     raw: Mapping[str, np.ndarray], layout: Layout, rows: np.ndarray, columns: np.ndarray
 ) -> None:
     """Add to products of kept unknowns, of each by itself, those of rows (..., n) over columns
-    (n,)."""
+    (n,); those of one unknown stand side by side, and each once."""
     names, first = list(layout.at), np.array([at.start for at in layout.at.values()])
     of = np.searchsorted(first, columns, side="right") - 1
     each = np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1)

@@ -331,7 +331,11 @@ class Source:
     def columns(self) -> dict[str, np.ndarray]:
         """Per-stop columns (K, ...) that effects may look at; see `stop_columns`."""
         recording = self.recording
-        columns = stop_columns(self.rig, recording.joints, recording.time_s, recording.covariates)
+        of_stops = recording.joints, recording.time_s, recording.covariates
+        try:
+            columns = stop_columns(self.rig, *of_stops)
+        except InputError as error:
+            raise InputError(f"{recording.folder / 'stops.csv'}: {error}") from None
         columns |= {"stop": np.array(recording.stops), "location": recording.location}
         if self.rig.tracker:
             columns["tracked"] = tracked_poses(self.rig, recording)

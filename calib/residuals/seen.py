@@ -230,8 +230,8 @@ class BodiesTogether:
     def table(
         self, values: Values, names: Sequence[str]
     ) -> tuple[np.ndarray, np.ndarray, dict[str, slice]]:
-        """Whitened rows (B, m) of the B blocks, their derivatives (B, m, N) by all that the whole
-        depends on, in the order of names, and which columns are whose; see `named`."""
+        """Whitened rows (B, m) of the B blocks, their derivatives (B, m, N) by some of what the
+        whole depends on, and which columns are whose; see `named`."""
         rows, d = self.whole.whitened({**values, **self._at(values)}, True)
         A, at = d.table(names)
         return rows.reshape(len(self.blocks), -1), A.reshape(len(self.blocks), -1, A.shape[2]), at

@@ -147,7 +147,7 @@ class _Checker:
             found.odd.extend(inventory.odd_times(recording))
             found.odd.extend(inventory.odd_copies(recording))
             found.odd.extend(inventory.odd_numbers(rig, recording))
-            found.odd.extend(inventory.odd_levels(rig, recording))
+            found.odd.extend(inventory.odd_levels(recording))
             found.odd.extend(inventory.odd_joints(rig, recording))
             self._tell(odd_bodies(rig, recording))
         scans = self._read_scans(rig)

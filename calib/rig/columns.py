@@ -62,8 +62,7 @@ def _payload(rig: Rig, count: int, recorded: Mapping[str, np.ndarray]) -> dict[s
         return {}
     if PAYLOAD in recorded and own[0] in recorded:
         raise InputError(
-            f"{rig.folder / 'stops.csv'}: {PAYLOAD} and {own[0]} both say what {rig.tips[0]} "
-            "carries; keep one of the columns"
+            f"{PAYLOAD} and {own[0]} both say what {rig.tips[0]} carries; keep one of the columns"
         )
     return {PAYLOAD: recorded.get(own[0], np.zeros(count))}
 

@@ -156,6 +156,11 @@ class Rig:
         """ "revolute" or "prismatic", by joint."""
         return tuple(joint.kind for joint in self.joints)
 
+    @property
+    def turning(self) -> frozenset[str]:
+        """Names of the joints that turn."""
+        return frozenset(joint.name for joint in self.joints if joint.kind == "revolute")
+
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))

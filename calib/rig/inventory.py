@@ -34,6 +34,7 @@ HEAVIEST_LOAD_KG = 2300.0
 # the next morning is not told, as that is some ten times as far as the first day was long.
 STAND_INS = (-9999.0, -999.0, -99.0, 99.0, 999.0, 9999.0, 32767.0, -32768.0, 65535.0)
 STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
+HEAD_DOWN = -0.5  # of the root's z along what points up: of a rig on a wall it is about 0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
 FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
@@ -134,6 +135,7 @@ def odd_numbers(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Numbers of stops that are hardly what they are taken for, and that no residual need show."""
     yield from odd_columns(recording)
     yield from odd_payloads(rig, recording)
+    yield from _head_down(rig, recording)
 
 
 def odd_rig(rig: Rig) -> Iterator[str]:
@@ -263,15 +265,18 @@ def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
             )
 
 
-def odd_levels(rig: Rig, recording: RecordedStops) -> Iterator[str]:
-    """Levels that say the rig hangs head down, and columns as an accelerometer writes them, of
-    which rig.yaml says nothing."""
-    if rig.levels and up_in_root(rig, recording).mean(axis=0)[2] < 0.0:
+def _head_down(rig: Rig, recording: RecordedStops) -> Iterator[str]:
+    """Levels that say the rig hangs head down."""
+    if rig.levels and up_in_root(rig, recording).mean(axis=0)[2] < HEAD_DOWN:
         yield (
             f"levels say that z of '{rig.tree.root}' points down; at rest they are to read 1 g "
             "along what points up. Does the rig hang from a ceiling? Else turn the signs of .ax, "
             ".ay and .az"
         )
+
+
+def odd_levels(recording: RecordedStops) -> Iterator[str]:
+    """Columns as an accelerometer writes them, of which rig.yaml says nothing."""
     for frame in undeclared_levels(recording.covariates):
         yield (
             f"stops.csv has {', '.join(level_columns(frame))}, as of an accelerometer in {frame}, "

@@ -65,11 +65,6 @@ def cautions(run: Run) -> list[str]:
         out.append("no stops were held out, so its predictions were not checked")
     if HELD_OUT_BY_CHANCE < (times := over_floor(run)) <= FAR_OFF:
         out.append(OVER.format(times))
-    if (up := run.summary.get("up")) and up["xyz"][2] < 0.0:
-        out.append(
-            f"up points down in '{up['frame']}', as levels have it; at rest they are to read 1 g "
-            "along what points up"
-        )
     out += run.summary.get("odd", ())  # which runs of earlier versions lack
     told = [*together_told(run.summary), *standing_out(run.summary)]
     return [*out, *_rings(run, bad=False), *told]

@@ -149,7 +149,7 @@ def test_levels_that_point_down_are_told(recording, tmp_path):
         told = check(folder, graph=False).odd
         assert any("levels say that z of" in str(each) for each in told) == wrong
     found = calib.fit(tmp_path / "rec", tmp_path / "run", hold_out="none")
-    assert [each for each in cautions(found) if "up points down in 'opti'" in each]
+    assert [each for each in cautions(found) if "levels say that z of" in each]
 
 
 @pytest.fixture(scope="module")

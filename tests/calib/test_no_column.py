@@ -1,5 +1,7 @@
 """Effects that look at a column that a recording has not."""
 
+import pickle
+
 import pandas as pd
 import pytest
 
@@ -9,7 +11,7 @@ from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.simulation import simulate
 from calib.simulation.spec import load_spec
-from chains.errors import InputError
+from chains.errors import InputError, NoColumnError
 
 DAMP = {"name": "damp", "site": "range", "unit": "m", "sigma": 0.001, "basis": "humidity - 0.5"}
 
@@ -35,3 +37,8 @@ def test_a_column_that_there_is_not_is_told_with_the_effect_that_looks_at_it(tmp
         calibrate([tmp_path / "friday"], tmp_path / "out", Model((find("tracker_creep"),)))
     assert "Without" not in str(raised.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_missing_is_told_from_a_worker_too():
+    error = pickle.loads(pickle.dumps(NoColumnError("there is no such column", "humidity")))
+    assert (str(error), error.column) == ("there is no such column", "humidity")

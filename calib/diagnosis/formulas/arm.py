@@ -54,8 +54,8 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
         lever = np.where(_unread(stand, layout, joint)[of_rows[1]], 0.0, A[:, columns].sum(axis=1))
         if found := _table(A[:, model], lever, *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
-            turning = frozenset(name for name in unit if unit[name] == "rad")
-            yield joint, replace(found, weight_m2=weight, joints=turning, unit=unit[joint])
+            known = {"joints": frozenset(rig.joint_names), "turning": rig.turning}
+            yield joint, replace(found, weight_m2=weight, unit=unit[joint], **known)
 
 
 def _unread(stand: Stand, layout: Layout, joint: str) -> np.ndarray:

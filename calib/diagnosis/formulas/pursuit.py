@@ -286,7 +286,7 @@ def _best_factors(
     others = bases.of([c for c in covariates if c != name], len(covariates))
     names = [name, "ring"] if name == "elevation_rad" and "ring" in table.covariates else [name]
     levels = bases.stops if name in table.by_stop else len(table)
-    round_ = name in table.joints
+    round_ = name in table.turning
     every = [f for n in names for f in factors(n, table.covariates[n], levels, round_)]
     blocks = []
     for each in every:

@@ -96,7 +96,7 @@ class Bases:
     def _line(self, name: str) -> np.ndarray:
         """(N, K) columns of one covariate, each with a mean of zero but those of angles."""
         values = self.table.covariates[name]
-        turns = {"azimuth_rad": (1, 2)}.get(name, (1,) if name in self.table.joints else ())
+        turns = {"azimuth_rad": (1, 2)}.get(name, (1,) if name in self.table.turning else ())
         if turns:
             waves = [f(m * values) for m in turns for f in (np.sin, np.cos)]
             columns = np.stack(waves, axis=1)

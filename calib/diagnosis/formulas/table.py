@@ -57,8 +57,8 @@ class BeamTable:
             sparse of beams, and dense of an arm, all of whose unknowns act on each pose; others_b:
             (R,) their right
             side; others_stop, others_place: (R,) of which they are, -1 for none.
-        unit: of `residual_m` and `sigma_m`: m of a range, or rad of a joint; see `joint_tables`.
-        joints: which covariates are joints of the arm.
+        unit: of `residual_m` and `sigma_m`: m of a range, m or rad of a joint; see `joint_tables`.
+        joints: which covariates are joints of the arm; turning: which of them turn.
         weight_m2: of all that was measured, 1/m2; None where that is these rows.
         own: sets of unknowns of which no row depends on two: those that only one stop has, of each
             stop, or parts of surfaces, of each surface.
@@ -79,6 +79,7 @@ class BeamTable:
     others_place: np.ndarray
     unit: str = "m"
     joints: frozenset[str] = frozenset()
+    turning: frozenset[str] = frozenset()
     weight_m2: float | None = None
     own: Sequence[np.ndarray] = ()
 
@@ -126,6 +127,7 @@ class BeamTable:
             others_stop=others_stop,
             others_place=others_place,
             joints=frozenset(scans[0].stops.rig.joint_names),
+            turning=scans[0].stops.rig.turning,
             own=cheapest(layout.size, list(layout.own.values()), surfaces),
         )
 

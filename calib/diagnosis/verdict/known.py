@@ -83,8 +83,8 @@ def _as_fitted(candidate: Candidate, before: Look, after: Look, p_adjusted: floa
         clusters=own.clusters,
         score=told,
     )
-    told = before.named.scores.told_as(test.columns, scores, np.arange(len(theta)))
-    taken_back = replace(told, weight_m2=scores.weight_m2)
+    changed = before.named.scores.told_as(test.columns, scores, np.arange(len(theta)))
+    taken_back = replace(changed, weight_m2=scores.weight_m2)
     return NamedEffect(
         candidate=replace(candidate, test=test),
         before=replace(before, named=replace(before.named, scores=taken_back)),

@@ -117,7 +117,7 @@ def test_stops_that_are_few_confirm_a_joint_that_turns_beside_azimuth():
         return 0.003 * np.cos(2 * c["elbow"]) * np.sin(c["azimuth_rad"])
 
     beams = table(5, more=elbow, hidden=turns, scatter_m=0.0005)
-    beams = replace(beams, by_stop=beams.by_stop | {"elbow"}, joints=frozenset({"elbow"}))
+    beams = replace(beams, by_stop=beams.by_stop | {"elbow"}, turning=frozenset({"elbow"}))
     found = screen_smooths(beams.projection(), Bases(beams, 30))
     assert found[0].covariates == ("azimuth_rad", "elbow") and found[0].plain
     (step,) = pursue(beams, ALPHA, lambda *_: None)
