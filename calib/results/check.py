@@ -144,7 +144,6 @@ class _Checker:
         if rig and recording:
             found.contents.extend(inventory.of_stops(rig, recording))
             found.odd.extend(inventory.odd_stops(rig, recording))
-            found.odd.extend(inventory.odd_times(recording))
             found.odd.extend(inventory.odd_copies(recording))
             found.odd.extend(inventory.odd_numbers(rig, recording))
             found.odd.extend(inventory.odd_levels(recording))

@@ -34,6 +34,7 @@ HEAVIEST_LOAD_KG = 2300.0
 # the next morning is not told, as that is some ten times as far as the first day was long.
 STAND_INS = (-9999.0, -999.0, -99.0, 99.0, 999.0, 9999.0, 32767.0, -32768.0, 65535.0)
 STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
+FEWEST_IN_ORDER = 6  # rows: in any order, two of so many are out of it in 1 of 48 draws
 HEAD_DOWN = -0.5  # of the root's z along what points up: of a rig on a wall it is about 0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
@@ -133,6 +134,7 @@ def of_beams(placed: Sequence[PlacedScan]) -> Iterator[Line]:
 
 def odd_numbers(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Numbers of stops that are hardly what they are taken for, and that no residual need show."""
+    yield from odd_times(recording)
     yield from odd_columns(recording)
     yield from odd_payloads(rig, recording)
     yield from _head_down(rig, recording)
@@ -183,7 +185,15 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
 
 
 def odd_times(recording: RecordedStops) -> Iterator[str]:
-    """Times in another unit than seconds."""
+    """Times in another unit than seconds, and two of them that seem exchanged."""
+    order = np.argsort(recording.time_s, kind="stable") if recording.timed else np.zeros(0, int)
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    if len(moved) == 2 and len(order) >= FEWEST_IN_ORDER:
+        a, b = (recording.stops[k] for k in moved)
+        yield (
+            f"rows of stops.csv follow each other in time_s but for {a} and {b}, and with the "
+            "times of these two exchanged all do; were they?"
+        )
     gaps_s = np.diff(np.sort(recording.time_s)) if recording.timed else np.zeros(0)
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0
     last_s = float(np.max(recording.time_s)) if recording.timed else 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -19,6 +20,9 @@ FULL_SCALES = {LARGEST_REFLECTANCE: ", a reflectance", 255.0: " of 255", 65535.0
 DOUBLED = 1 / 3  # a choice: of points by chance none repeats another; of a copy half do
 PRIMES = (2, 3, 5, 7)  # by whose roots columns are added up: no two rows come to one number
 FLOAT32 = 4e-7  # of the largest: float32 has 6e-8, and a length has that of three numbers, rounded
+FEWEST_SCANS = 4  # by which it is seen how rings are usually numbered
+MOST_RENUMBERED = 2  # rings by which a scan's numbers may be off
+RENUMBERED = 0.25  # of how far its rings point from where others of their numbers do
 LEAST_VALUES = 20  # different ones in a column, for its repetition to be no chance
 
 
@@ -32,6 +36,7 @@ class ScanSums:
         sweeps: the most returns that were averaged into a point.
         rings: (R,) points by ring.
         elevation_rad: (R,) sum of the beams' elevations by ring.
+        by_scan: scan -> (R,) mean elevation by ring, NaN of those that are not seen.
         columns: names of the per-point covariates.
         intensity: scan -> its largest intensity, where it has any.
         darkest: the least intensity.
@@ -48,6 +53,7 @@ class ScanSums:
     sweeps: int = 0
     rings: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     elevation_rad: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    by_scan: dict[str, np.ndarray] = field(default_factory=dict)
     columns: dict[str, None] = field(default_factory=dict)
     intensity: dict[str, float] = field(default_factory=dict)
     darkest: float = np.inf
@@ -71,7 +77,10 @@ class ScanSums:
         self.rings = rings
         if self.lidar:
             up_rad = beams(scan.xyz_m, self.lidar.beam_origin_m).elevation_rad
-            self.elevation_rad += np.bincount(scan.ring, up_rad, len(self.elevation_rad))
+            total = np.bincount(scan.ring, up_rad, len(self.elevation_rad))
+            self.elevation_rad += total
+            seen = np.bincount(scan.ring, minlength=len(total))
+            self.by_scan[name] = np.where(seen, total / np.maximum(seen, 1), np.nan)
         away_m = np.linalg.norm(scan.xyz_m, axis=1)
         self.reach_m = max(self.reach_m, float(np.quantile(away_m, 0.95)))
         if step_m := step_of(away_m):
@@ -150,6 +159,7 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
     numbered = numbering(scans)
     if numbered is not None:
         yield Suspect("rings", rig.lidar.name, numbered.sentence, size=numbered.off_rad, unit="rad")
+    yield from _renumbered(scans)
     if scans.doubled:
         yield (
             f"points of {listed(scans.doubled)} are there twice, and would count as independent; "
@@ -169,6 +179,32 @@ def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[s
 def numbering(scans: ScanSums) -> RingFinding | None:
     """How rings are numbered otherwise than their LiDAR's model has it, if they are."""
     return odd_rings(scans.lidar, ring_elevations(scans.elevation_rad, scans.rings))
+
+
+def _renumbered(scans: ScanSums) -> Iterator[Suspect]:
+    """Scans whose rings are numbered otherwise than those of most, by so many."""
+    if len(scans.by_scan) < FEWEST_SCANS:
+        return
+    each = np.array(list(scans.by_scan.values()))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of rings that no scan shows
+        usual = np.nanmedian(each, axis=0)
+        off_rad = np.nanmedian(np.abs(each - usual), axis=1)
+        found: dict[int, list[str]] = {}
+        for by in (b for b in range(-MOST_RENUMBERED, MOST_RENUMBERED + 1) if b):
+            there = np.roll(usual, -by)
+            there[-by if by > 0 else 0 : None if by > 0 else -by] = np.nan
+            near = np.nanmedian(np.abs(each - there), axis=1) < RENUMBERED * off_rad
+            for name, one in zip(scans.by_scan, near, strict=True):
+                if one:
+                    found.setdefault(by, []).append(name)
+    for by, names in found.items():
+        if len(names) < len(each) / 2:
+            said = (
+                f"rings of the scans of {listed(names)} are numbered {abs(by)} "
+                f"{'lower' if by > 0 else 'higher'} than those of the others, by where they point"
+            )
+            yield Suspect("scan", names[0], said, stops=tuple(names))
 
 
 def _coarse(scans: ScanSums, lidar: LidarModel) -> Iterator[str]:

@@ -34,8 +34,8 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
-    near = "still above" if over_floor(evidence.run) > HELD_OUT_BY_CHANCE else "down to"
-    near = "below" if last > first and last <= floor else near
+    over = over_floor(evidence.run)
+    near = "still above" if over > HELD_OUT_BY_CHANCE else "down to" if over > 1.0 else "below"
     yield Chart(
         "ladder",
         f"The {kind} error went{way} to {last:.2f} mm, {near} the {floor:.2f} mm expected"
