@@ -297,6 +297,8 @@ def _open(folder: Path, rig: Rig | None) -> RecordedStops:
 def _place(scan: ScanStop, values: Values) -> PlacedScan:
     rows = scan.rows(values)
     met = rows.weight > 0
+    meant_m = rows.view["range_m"][rows.usable]
+    measured_m = meant_m + rows.residual_m[rows.usable]
     return PlacedScan(
         name=scan.name,
         T=scan.pose(values),
@@ -304,6 +306,7 @@ def _place(scan: ScanStop, values: Values) -> PlacedScan:
         range_m=rows.view["range_m"][met],
         incidence_rad=rows.view["incidence_rad"][met],
         residual_m=rows.median_m,
+        further=float(np.median(meant_m / measured_m)) if len(meant_m) else 1.0,
     )
 
 

@@ -34,6 +34,7 @@ HEAVIEST_LOAD_KG = 2300.0
 # the next morning is not told, as that is some ten times as far as the first day was long.
 STAND_INS = (-9999.0, -999.0, -99.0, 99.0, 999.0, 9999.0, 32767.0, -32768.0, 65535.0)
 STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
+ANOTHER_UNIT = 2.0  # times as far as measured: of feet for metres 3.3, were the scan well placed
 FEWEST_IN_ORDER = 6  # rows: in any order, two of so many are out of it in 1 of 48 draws
 HEAD_DOWN = -0.5  # of the root's z along what points up: of a rig on a wall it is about 0
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
@@ -61,6 +62,7 @@ class PlacedScan:
         share: of the beams that meet a surface.
         range_m, incidence_rad: (n,) of those.
         residual_m: median of their size.
+        further: median of how many times as far as measured the surfaces lie.
     """
 
     name: str
@@ -69,6 +71,7 @@ class PlacedScan:
     range_m: np.ndarray
     incidence_rad: np.ndarray
     residual_m: float
+    further: float
 
 
 # ---------------------------------------------------------------------------------- what is there
@@ -329,11 +332,13 @@ def odd_beams(placed: Sequence[PlacedScan]) -> Iterator[str]:
             f"beams meet surfaces at {low:.0f} to {high:.0f} deg from their normal only; what "
             "depends on incidence cannot be told from an offset"
         )
-    off = [p.name for p in placed if p.residual_m > FAR_OFF_M]
-    if off:
+    if off := [p for p in placed if p.residual_m > FAR_OFF_M]:
+        times = float(np.median([p.further for p in off]))
+        unit = max(times, 1.0 / times) > ANOTHER_UNIT
         yield (
-            f"at {listed(off)} half of the beams end more than {FAR_OFF_M:g} m from the surface "
-            "that they should meet; check base_guess, tracker and targets"
+            f"at {listed([p.name for p in off])} half of the beams end more than {FAR_OFF_M:g} m "
+            "from the surface that they should meet; check base_guess, tracker and targets"
+            + (f", and the unit of the mesh, which lies {times:.2g} times as far" if unit else "")
         )
 
 

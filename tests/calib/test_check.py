@@ -308,7 +308,7 @@ def test_a_sigma_in_millimetres(rec):
     assert_odd(rec, "reference.sigma_m is 0.6 m in rig.yaml")
 
 
-def placed(roll_rad, incidence_deg=(5, 70), residual_m=0.01):
+def placed(roll_rad, incidence_deg=(5, 70), residual_m=0.01, further=1.0):
     """Scans of stops that turn about z and lean by `roll_rad`, one each."""
     spread = np.radians(np.linspace(*incidence_deg, 50))
     return [
@@ -319,6 +319,7 @@ def placed(roll_rad, incidence_deg=(5, 70), residual_m=0.01):
             range_m=np.ones(50),
             incidence_rad=spread,
             residual_m=residual_m,
+            further=further,
         )
         for k, roll in enumerate(roll_rad)
     ]
@@ -338,6 +339,9 @@ def test_views_that_differ_are_not_odd():
         ({"roll_rad": [0.0, 0.02, 0.0]}, "spin axis points the same way at all stops"),
         ({"incidence_deg": (40, 60)}, "at 41 to 59 deg from their normal only"),
         ({"residual_m": 0.4}, "at s0, s1, s2 and 1 more half of the beams end more than 0.3 m"),
+        ({"residual_m": 0.4}, "that they should meet; check base_guess, tracker and targets"),
+        ({"residual_m": 4.0, "further": 3.3}, "the unit of the mesh, which lies 3.3 times as far"),
+        ({"residual_m": 4.0, "further": 0.3}, "the unit of the mesh, which lies 0.3 times as far"),
     ],
 )
 def test_views_that_are_alike_or_beside_the_room(change, sentence):
