@@ -79,8 +79,8 @@ class ArmGearError(ArmJointEccentricity):
 
 
 class ArmScrewError(ArmJointEccentricity):
-    """What drives a linear joint is uneven: the travel errs once in each lead of a screw, tooth of
-    a rack or turn of a pinion."""
+    """A linear joint's screw, rack or pinion is uneven. The travel errs once in each lead of the
+    screw, tooth of the rack or turn of the pinion."""
 
     name = "arm_screw_error"
     joint_kind = "prismatic"

@@ -114,10 +114,10 @@ class ArmPayloadOffset(Effect):
 
 
 class ArmPayloadMoment(ArmPayloadOffset):
-    """The payload's centre of mass lies beside the tip, and each joint gives way to the torque of
-    that by a compliance of its own, as wrists are softer than shoulders.
+    """Each joint gives way to a payload beside the tip. It does so by a compliance of its own, as
+    wrists are softer than shoulders.
 
-    An amount is the joint's compliance times how far the centre lies from the tip.
+    An amount is the joint's compliance times how far the payload's centre lies from the tip.
     """
 
     name = "arm_payload_moment"
