@@ -351,22 +351,31 @@ def place(
         reference: variable of T_world_reference, or None.
     """
     view = View(rig, len(joints), columns, joints)
-    edges, axes = ({}, {}), ({}, {})
-    for site, (bases, which) in zip((Site.EDGE, Site.JOINTS), (edges, axes), strict=True):
-        for t in (t for t in terms if t.effect.site is site and not t.effect.widens):
-            basis = t.basis(view)
-            which[t.variable] = moved = np.flatnonzero(basis.any(axis=(0, *range(2, basis.ndim))))
-            bases[t.variable] = basis if len(moved) == basis.shape[1] else basis[:, moved]
+    edge_bases, edges = _acting(terms, Site.EDGE, view)
+    joint_bases, axes = _acting(terms, Site.JOINTS, view)
     return Stops(
         rig=rig,
         joints=joints,
-        edge_bases=edges[0],
-        edges=edges[1],
-        joint_bases=axes[0],
-        axes=axes[1],
+        edge_bases=edge_bases,
+        edges=edges,
+        joint_bases=joint_bases,
+        axes=axes,
         root=root,
         reference=reference,
     )
+
+
+def _acting(
+    terms: Sequence[Term], site: Site, view: View
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Variable -> basis of the edges or joints that it moves alone, and which of all these are."""
+    bases, moved = {}, {}
+    for t in (t for t in terms if t.effect.site is site and not t.effect.widens):
+        basis = t.basis(view)
+        some = np.flatnonzero(basis.any(axis=(0, *range(2, basis.ndim))))
+        moved[t.variable] = some
+        bases[t.variable] = basis if len(some) == basis.shape[1] else basis[:, some]
+    return bases, moved
 
 
 def _flat(basis: np.ndarray) -> np.ndarray:

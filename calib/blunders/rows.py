@@ -304,7 +304,7 @@ def _exact_joints(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]
             weight=np.ones(count),
             sigma=np.ones(count),
             axes=dofs,
-            units=tuple("rad" if k == "revolute" else "m" for k in rigs[stop].joint_kinds),
+            units=tuple(rigs[stop].joint_units.values()),
             groups=_joints(dofs, np.split(np.eye(count), count, axis=1), where, recording),
             information=sum(part.information for part in parts),
         )

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import Creeps, Settles, Slips, joint_units, warmer_k
+from calib.effects.basis import Creeps, Settles, Slips, warmer_k
 from calib.rig import Rig
 from chains.frames import Edge
 from chains.minimal import Own, across, own_errors
@@ -58,7 +58,7 @@ class ArmJointOffset(Effect):
     sigma = 0.005
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(Param.of_joint(j, unit, self.sigma) for j, unit in joint_units(rig).items())
+        return tuple(Param.of_joint(j, unit, self.sigma) for j, unit in rig.joint_units.items())
 
     def basis(self, view: View) -> np.ndarray:
         return np.eye(len(view.rig.joint_names))[None]

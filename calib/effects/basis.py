@@ -129,9 +129,3 @@ class Settles(Effect):
     def when(self, elapsed_s: np.ndarray) -> np.ndarray:
         """How much of it has happened (K,) at times since the first stop."""
         return settled(elapsed_s, self.shape)
-
-
-def joint_units(rig: Rig) -> dict[str, str]:
-    """The unit of every joint, by its name."""
-    units = {"revolute": "rad", "prismatic": "m"}
-    return {j: units[kind] for j, kind in zip(rig.joint_names, rig.joint_kinds, strict=True)}

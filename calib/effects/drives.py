@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
-from calib.effects.basis import joint_units
 from calib.rig import Rig
 
 
@@ -44,12 +43,12 @@ class ArmJointEccentricity(Effect):
     shape = 1.0
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        mine = [joint for joint, unit in joint_units(rig).items() if unit == self.unit]
+        mine = [joint for joint, unit in rig.joint_units.items() if unit == self.unit]
         each = [(joint, wave) for joint in mine for wave in ("sin", "cos")]
         return tuple(Param.of_joint(joint, self.unit, self.sigma, wave) for joint, wave in each)
 
     def basis(self, view: View) -> np.ndarray:
-        mine = [j for j, unit in enumerate(joint_units(view.rig).values()) if unit == self.unit]
+        mine = [j for j, unit in enumerate(view.rig.joint_units.values()) if unit == self.unit]
         basis = np.zeros((*view.joints.shape, 2 * len(mine)))
         for p, j in enumerate(mine):
             turn = self.turn(view.joints[:, j])
@@ -123,9 +122,7 @@ class ArmBacklash(Effect):
     column = "moved"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(
-            Param.of_joint(joint, unit, 0.0005) for joint, unit in joint_units(rig).items()
-        )
+        return tuple(Param.of_joint(joint, unit, 0.0005) for joint, unit in rig.joint_units.items())
 
     def basis(self, view: View) -> np.ndarray:
         way = np.stack([view[f"{self.column}.{joint}"] for joint in view.rig.joint_names], axis=1)

@@ -14,7 +14,7 @@ from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
 from calib.effects.rig import mount_edges
 from calib.rig import Rig
-from calib.rig.columns import PAYLOAD
+from calib.rig.columns import PAYLOAD, load_columns
 from chains import se3
 from chains.arm import UPRIGHT, Mass, gravity_moment, gravity_torque
 
@@ -88,8 +88,8 @@ class ArmPayloadOffset(Effect):
     source = "stiffness of arms: Klimchik et al.; size assumed"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        turns = "revolute" in rig.joint_kinds
-        return tuple(Param(n, self.unit, 0.2 * SOFT) for n in self.centres(rig)) if turns else ()
+        centres = self.centres(rig) if rig.turning else ()
+        return tuple(Param(name, self.unit, 0.2 * SOFT) for name in centres)
 
     def centres(self, rig: Rig) -> list[str]:
         """Where the centre of what each tip carries lies, along the tip's axes."""
@@ -126,13 +126,15 @@ class ArmPayloadMoment(ArmPayloadOffset):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(
-            Param.of_joint(rig.joint_names[j], self.unit, 0.2 * SOFT, centre)
-            for j in _turning(rig)
+            Param.of_joint(joint, self.unit, 0.2 * SOFT, centre)
+            for joint in rig.joint_names
+            if joint in rig.turning
             for centre in self.centres(rig)
         )
 
     def basis(self, view: View) -> np.ndarray:
-        of_all, mine = super().basis(view), _turning(view.rig)
+        of_all, names = super().basis(view), view.rig.joint_names
+        mine = [j for j, joint in enumerate(names) if joint in view.rig.turning]
         basis = np.zeros((*of_all.shape[:2], len(mine), of_all.shape[2]))
         basis[:, mine, np.arange(len(mine))] = of_all[:, mine]
         return basis.reshape(*of_all.shape[:2], len(mine) * of_all.shape[2])
@@ -266,18 +268,11 @@ def up(view: View) -> np.ndarray:
 
 def _payloads(view: View) -> list[Mass]:
     """What the tips carry: the first ``payload_kg``, any other ``<tip>.payload_kg``."""
-    tips = view.rig.tips
-    columns = {tip: f"{tip}.{PAYLOAD}" for tip in tips} | {tip: PAYLOAD for tip in tips[:1]}
     return [
         Mass(tip, finite(view[column]), np.zeros(3))
-        for tip, column in columns.items()
+        for tip, column in load_columns(view.rig).items()
         if column in view.columns
     ]
-
-
-def _turning(rig: Rig) -> list[int]:
-    """Which joints turn."""
-    return [j for j, kind in enumerate(rig.joint_kinds) if kind == "revolute"]
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

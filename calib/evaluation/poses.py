@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.effects import Effect, View
 from calib.problem.model import Source
-from calib.rig.columns import PAYLOAD, recorded_columns, stop_columns
+from calib.rig.columns import load_columns, recorded_columns, stop_columns
 from chains.errors import InputError, NoColumnError
 
 MEASURED_POSES = 20  # by which it is seen whether an effect feels a payload; a choice
@@ -17,7 +17,7 @@ MEASURED_POSES = 20  # by which it is seen whether an effect feels a payload; a 
 def loads_felt(source: Source, effects: Iterable[Effect]) -> dict[str, str]:
     """Columns by which a recording says that the arm carries something, and an effect that bends
     the arm otherwise by it; of those that have one."""
-    loads = [PAYLOAD, *(f"{tip}.{PAYLOAD}" for tip in source.rig.tips[1:])]
+    loads = load_columns(source.rig).values()
     stated = [n for n in loads if n in source.columns and np.nan_to_num(source.columns[n]).any()]
     found = ((n, next((e.name for e in effects if _feels(source, e, n)), None)) for n in stated)
     return {load: effect for load, effect in found if effect}
@@ -52,7 +52,7 @@ def pose_columns(
         if load not in columns:
             raise InputError(
                 f"effect '{effect}' feels what the arm carries, and the recording states {load}; "
-                f"give {load} of these poses too, 0 where the arm carries nothing"
+                f"give {load} for these poses too, 0 where the arm carries nothing"
             )
     return columns
 
@@ -85,7 +85,7 @@ def basis_at(effect: Effect, view: View) -> np.ndarray:
         return effect.basis(view)
     except NoColumnError as error:
         raise InputError(
-            f"effect '{effect.name}' looks at column '{error.column}', which was not given of "
+            f"effect '{effect.name}' looks at column '{error.column}', which was not given for "
             "these poses; give it, for each of them"
         ) from None
 

@@ -9,15 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.intake.jumps import Jump, jump_of
-from calib.intake.likeness import (
-    LEAST_LIKE,
-    LOBE_S,
-    RIVAL,
-    correlation,
-    evidence_of,
-    likeness_of,
-    vertex,
-)
+from calib.intake.likeness import LEAST_LIKE, best_of, correlation, likeness_of, vertex
 from calib.intake.motion import Motion, motions
 from chains.errors import InputError
 from chains.frames import Edge
@@ -234,10 +226,9 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     """What is added to the times of `mine` so that it moves when `other` does.
 
     Both speeds are correlated at all offsets at which enough of them overlaps, masked where either
-    is not known. The offset is where a correlation r over n samples is the least likely by chance,
-    the maximum of -n log(1 - r^2), to a fraction of a sample by a parabola. Its sigma comes from
-    the scatter of the offsets of parts of the logs; where clocks drift apart, from how well these
-    predict each other.
+    is not known. The offset is the best of all (`best_of`), to a fraction of a sample by a
+    parabola. Its sigma comes from the scatter of the offsets of parts of the logs; where clocks
+    drift apart, from how well these predict each other.
 
     Returns:
         None where one of the two hardly moves; a sigma of NaN where another offset is as good.
@@ -249,17 +240,14 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
     lag, likeness, count = likeness_of(a, b)
     if not np.isfinite(likeness).any():
         return None
-    evidence = evidence_of(likeness, count)
-    best = int(np.nanargmax(evidence))
+    best, rivalled = best_of(lag, likeness, count, step_s)
     peak_s = (lag[best] + vertex(likeness, best)) * step_s
-    far = np.abs(lag - lag[best]) * step_s > LOBE_S
-    rival = np.nanmax(evidence, where=far & np.isfinite(evidence), initial=0.0)
     offset_s = float(other.time_s[0] - mine.time_s[0] + peak_s)
     top = float(likeness[best])
     always = Added.always(offset_s)
     if top < WHOLLY_LIKE and (jump := jump_of(a, b, step_s)) and jump.likeness > top:
         return _jumped(mine, float(other.time_s[0] - mine.time_s[0]), jump, step_s)
-    if rival > RIVAL * evidence[best] and top > LEAST_LIKE:
+    if rivalled and top > LEAST_LIKE:
         return Offset(offset_s, np.nan, top, added=always)
     at, shift_s = _parts(a, b, int(lag[best]), step_s)
     drift_s = _drift(shift_s)

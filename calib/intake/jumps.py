@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib.intake.likeness import LEAST_LIKE, LOBE_S, RIVAL, evidence_of, likeness_of, vertex
+from calib.intake.likeness import LEAST_LIKE, best_of, likeness_of, vertex
 from chains.se3 import Array
 
 JUMP_PARTS = 8  # of a log, whose offsets are sought one by one, wherever they may be
@@ -47,11 +47,8 @@ def own_lags(a: Array, b: Array, step_s: float) -> tuple[Array, Array]:
         like = np.where(count > COUNTERPARTS * np.isfinite(a[low:high]).sum(), like, np.nan)
         if not np.isfinite(like).any():
             continue
-        told = evidence_of(like, count)
-        best = int(np.nanargmax(told))
-        far = (np.abs(lag - lag[best]) * step_s > LOBE_S) & np.isfinite(told)
-        rival = np.max(told, where=far, initial=0.0)
-        if like[best] >= LEAST_LIKE and rival <= RIVAL * told[best]:
+        best, rivalled = best_of(lag, like, count, step_s)
+        if like[best] >= LEAST_LIKE and not rivalled:
             first.append(low)
             found.append(lag[best] - low + vertex(like, best))
     return np.array(first, int), np.array(found)

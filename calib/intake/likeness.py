@@ -49,9 +49,17 @@ def vertex(values: Array, k: int) -> float:
     return 0.0 if curve >= 0 else float(np.clip((before - after) / (2 * curve), -1, 1))
 
 
-def evidence_of(likeness: Array, count: Array) -> Array:
-    """How unlikely correlations (L,) over so many samples are by chance: ``-n log(1 - r^2)``."""
-    return -count * np.log1p(-(np.clip(likeness, 0, 0.9999) ** 2))
+def best_of(lag: Array, likeness: Array, count: Array, step_s: float) -> tuple[int, bool]:
+    """Which of some lags (L,) in steps is the best, and whether another, far from it, is as good.
+
+    The best is where a correlation r over n samples is the least likely by chance, the maximum of
+    ``-n log(1 - r^2)``.
+    """
+    evidence = -count * np.log1p(-(np.clip(likeness, 0, 0.9999) ** 2))
+    best = int(np.nanargmax(evidence))
+    far = np.abs(lag - lag[best]) * step_s > LOBE_S
+    rival = np.max(evidence, where=far & np.isfinite(evidence), initial=0.0)
+    return best, bool(rival > RIVAL * evidence[best])
 
 
 def correlation(a: Array, b: Array) -> float:

@@ -127,10 +127,8 @@ class Linearisation:
         say the same of each state in which what was eliminated follows the kept."""
         found = np.empty((rows.shape[0], len(self.layout.kept)))
         first = np.full(len(found), len(self.eliminated))
-        gone, row = (
-            self._gone_in[rows.indices],
-            np.repeat(np.arange(len(found)), np.diff(rows.indptr)),
-        )
+        gone = self._gone_in[rows.indices]
+        row = np.repeat(np.arange(len(found)), np.diff(rows.indptr))
         np.minimum.at(first, row[gone >= 0], gone[gone >= 0])
         order = np.argsort(first, kind="stable")  # those of one stop together
         for some in np.array_split(order, range(ROWS_AT_ONCE, len(order), ROWS_AT_ONCE)):

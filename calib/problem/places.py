@@ -180,7 +180,7 @@ class Places:
         if not sigma.any():
             return stops
         stop = source.recording.stops[index[0]]
-        units = tuple("rad" if kind == "revolute" else "m" for kind in source.rig.joint_kinds)
+        units = tuple(source.rig.joint_units.values())
         name = self.problem.add(
             vector_unknown(
                 _joints(self.part.prefix, stop),

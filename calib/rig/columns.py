@@ -67,6 +67,11 @@ def _payload(rig: Rig, count: int, recorded: Mapping[str, np.ndarray]) -> dict[s
     return {PAYLOAD: recorded.get(own[0], np.zeros(count))}
 
 
+def load_columns(rig: Rig) -> dict[str, str]:
+    """The column that says what each tip carries: of the first that without a name."""
+    return {tip: f"{tip}.{PAYLOAD}" for tip in rig.tips} | {tip: PAYLOAD for tip in rig.tips[:1]}
+
+
 def recorded_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A recording's own columns (K,) as effects look at them: ``temperature_c`` that was read at
     some stops only is at the others as it is at these on average."""

@@ -157,6 +157,11 @@ class Rig:
         return tuple(joint.kind for joint in self.joints)
 
     @property
+    def joint_units(self) -> dict[str, str]:
+        """The unit of every joint, by its name."""
+        return {j.name: "rad" if j.kind == "revolute" else "m" for j in self.joints}
+
+    @property
     def turning(self) -> frozenset[str]:
         """Names of the joints that turn."""
         return frozenset(joint.name for joint in self.joints if joint.kind == "revolute")

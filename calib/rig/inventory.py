@@ -194,8 +194,8 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
     if len(moved) == 2 and len(order) >= FEWEST_IN_ORDER:
         a, b = (recording.stops[k] for k in moved)
         yield (
-            f"rows of stops.csv follow each other in time_s but for {a} and {b}, and with the "
-            "times of these two exchanged all do; were they?"
+            f"the rows of stops.csv are in the order of time_s but for {a} and {b}, and all would "
+            "be with the times of these two exchanged; are they?"
         )
     gaps_s = np.diff(np.sort(recording.time_s)) if recording.timed else np.zeros(0)
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0

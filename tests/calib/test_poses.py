@@ -35,7 +35,7 @@ def test_a_payload_that_an_effect_feels_is_to_be_given(folder):
     joints = rng.uniform(-1, 1, (5, 6))
     part, known, _ = found(source, ["arm_gravity_sag"], rng)
     arm = Arm.as_found(source, part, known)
-    with pytest.raises(InputError, match=r"'arm_gravity_sag' feels .* give payload_kg of these"):
+    with pytest.raises(InputError, match=r"'arm_gravity_sag' feels .* give payload_kg for these"):
         arm.corrected(joints)
     empty, full = (arm.corrected(joints, {"payload_kg": np.full(5, kg)}) for kg in (0.0, 4.0))
     assert np.abs(full - empty)[:, :3, 3].max() > 1e-4

@@ -33,9 +33,7 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     `residual_m` is how much further it is moved than it says, `sigma_m` how well one pose tells.
     Poses at which nobody read the joint are not among them."""
     rig = stand.sources[0].rig
-    units = ("rad" if kind == "revolute" else "m" for kind in rig.joint_kinds)
-    unit = dict(zip(rig.joint_names, units, strict=True))
-    levers = [_lever(i, *each) for i, each in enumerate(unit.items())]
+    levers = [_lever(i, *each) for i, each in enumerate(rig.joint_units.items())]
     wide, values = beside(
         stand.problem_of(stand.model.plus(tuple(effect for _, effect in levers))), stand.estimate
     )
@@ -55,7 +53,7 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
         if found := _table(A[:, model], lever, *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
             known = {"joints": frozenset(rig.joint_names), "turning": rig.turning}
-            yield joint, replace(found, weight_m2=weight, unit=unit[joint], **known)
+            yield joint, replace(found, weight_m2=weight, unit=rig.joint_units[joint], **known)
 
 
 def _unread(stand: Stand, layout: Layout, joint: str) -> np.ndarray:
