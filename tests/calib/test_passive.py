@@ -172,10 +172,11 @@ def test_what_makes_no_sense_of_passive_joints_is_refused(folders, tmp_path):
 
 
 def test_no_formula_is_sought_for_a_joint_that_nobody_read(folders, tmp_path):
-    """All that it is off by is in its readings, which are free; at a stop where another joint was
-    not read, that is left out likewise."""
+    """All that it is off by is in its readings, which are free. One that was not read at a single
+    stop has its formula: that stop hardly counts."""
     (source,) = leave_out([Source.open(folders[1])], ["L00P01:joint_3"])
     problem = build([source], Model())
     tables = dict(joint_tables(Stand([source], Model(), problem, solve(problem))))
     assert set(tables) == {f"joint_{i}" for i in (1, 3, 4, 6)}
-    assert [len(tables[joint]) for joint in ("joint_1", "joint_3")] == [40, 39]
+    sigma = tables["joint_3"].sigma_m
+    assert np.sum(sigma > 0.1) == 1 and np.sum(sigma < 0.01) == 39

@@ -31,9 +31,12 @@ ANGLE_SEEN = 1e-6  # of the largest: a joint whose angle changes less at a pose 
 def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     """Each joint that the trackers see, and its table, in rad, or in m of a linear one:
     `residual_m` is how much further it is moved than it says, `sigma_m` how well one pose tells.
-    Poses at which nobody read the joint are not among them."""
+    Not of a passive one, which is where the rest of the arm has it."""
     rig = stand.sources[0].rig
-    levers = [_lever(i, *each) for i, each in enumerate(rig.joint_units.items())]
+    read = {n: unit for n, unit in rig.joint_units.items() if n not in rig.passive}
+    if not read:
+        return
+    levers = [_lever(i, *each) for i, each in enumerate(read.items())]
     wide, values = beside(
         stand.problem_of(stand.model.plus(tuple(effect for _, effect in levers))), stand.estimate
     )
@@ -49,22 +52,10 @@ def joint_tables(stand: Stand) -> Iterator[tuple[str, BeamTable]]:
     at = {joint: np.searchsorted(shared, mine) for joint, mine in columns.items()}
     model = np.setdiff1d(np.arange(len(shared)), np.concatenate(list(at.values())))
     for joint, columns in at.items():
-        lever = np.where(_unread(stand, layout, joint)[of_rows[1]], 0.0, A[:, columns].sum(axis=1))
-        if found := _table(A[:, model], lever, *of_rows, covariates):
+        if found := _table(A[:, model], A[:, columns].sum(axis=1), *of_rows, covariates):
             weight = sum(len(body.measured) / body.sigma_m**2 for body in wide.bodies)
             known = {"joints": frozenset(rig.joint_names), "turning": rig.turning}
-            yield joint, replace(found, weight_m2=weight, unit=rig.joint_units[joint], **known)
-
-
-def _unread(stand: Stand, layout: Layout, joint: str) -> np.ndarray:
-    """Whether nobody read a joint at each stop of a layout (S + 1,); False of none, which is last:
-    what such a joint is turned by tells nothing but how the rest of the arm is off."""
-    source = stand.sources[0]
-    names, folder = source.recording.stops, source.recording.folder
-    stops = [k for k, name in enumerate(names) if (name, joint) in source.unread]
-    out = np.zeros(max(layout.stops.values(), default=-1) + 2, bool)
-    out[[layout.stops[folder, k] for k in stops if (folder, k) in layout.stops]] = True
-    return out
+            yield joint, replace(found, weight_m2=weight, unit=read[joint], **known)
 
 
 def _shared(layout: Layout) -> np.ndarray:
