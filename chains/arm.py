@@ -17,7 +17,7 @@ from chains import se3
 from chains.errors import InputError
 from chains.frames import Edge, FrameTree, Joint, unknown_name
 from chains.se3 import Array
-from chains.serial import SerialChain
+from chains.serial import SerialChain, cross
 from chains.xml import numbers_of, origin_of, read_robot
 
 G = 9.80665  # m/s^2
@@ -143,14 +143,14 @@ def gravity_torque(
         axes, at_m = chain.axes_and_points(
             joints[:, ours], edges, np.array([mass.centre_m for mass in mine])
         )
-        kg = np.stack([np.broadcast_to(mass.kg, len(joints)) for mass in mine], axis=1)
         before = np.array([chain.behind[edge][0] for edge in edges])
-        beyond = (before[:, None] > np.arange(len(chain.turns))).astype(float)
+        beyond = (before > np.arange(len(chain.turns))[:, None]).astype(float)
         # Of all that lies beyond each axis: how much, and the sum of where, weighed by that.
-        whole, first = kg @ beyond, beyond.T @ (kg[..., None] * at_m)
-        across = np.cross(axes.direction, first - whole[..., None] * axes.at_m)
-        along = np.where(chain.turns[:, None], across, whole[..., None] * axes.direction)
-        torque[:, ours] -= G * np.vecdot(along, np.atleast_2d(up)[:, None]) @ chain.by.T
+        kg = np.stack([np.broadcast_to(mass.kg, len(joints)) for mass in mine])[:, None]
+        whole, first = (np.tensordot(beyond, of, axes=1) for of in (kg, kg * at_m))
+        across = cross(axes.direction, first - whole * axes.at_m)
+        along = np.where(chain.turns[:, None, None], across, whole * axes.direction)
+        torque[:, ours] -= G * (chain.by @ (along * np.atleast_2d(up).T).sum(axis=1)).T
     return torque
 
 

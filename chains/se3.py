@@ -50,6 +50,14 @@ def _angle(w: Array) -> Array:
     return np.sqrt(np.vecdot(w, w))
 
 
+def _turned(along: Array, cosine: Array) -> Array:
+    """Return (..., 3) along vectors (..., 3), which are as long as the sine of an angle that has
+    this cosine (...) to the same scale, others that are as long as the angle."""
+    sine = _angle(along)
+    some = np.where(sine > 0.0, sine, 1.0)  # where it is 0, so is the turn
+    return (np.arctan2(sine, cosine) / some)[..., None] * along
+
+
 def _transform(R: Array, p: Array) -> Array:
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], p.shape[:-1]), 4, 4))
     T[..., :3, :3] = R
@@ -83,10 +91,22 @@ def so3_exp(w: ArrayLike) -> Array:
 
 def so3_log(R: ArrayLike) -> Array:
     """Return the rotation vectors (..., 3) of R (..., 3, 3), of length at most pi."""
-    q = _quat_wxyz(np.asarray(R, float))
-    half = np.sqrt(np.vecdot(q[..., 1:], q[..., 1:]))
-    some = np.where(half > 0.0, half, 1.0)  # sine of half the angle; where it is 0, so is the turn
-    return (2.0 * np.arctan2(half, q[..., 0]) / some)[..., None] * q[..., 1:]
+    R = np.asarray(R, float)
+    sine_axis = np.stack(
+        [
+            R[..., 2, 1] - R[..., 1, 2],
+            R[..., 0, 2] - R[..., 2, 0],
+            R[..., 1, 0] - R[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    twice_cosine = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0
+    w = _turned(sine_axis, twice_cosine)
+    far = twice_cosine < 0.0  # more than a quarter turn, whose sine says less and less
+    if np.any(far):
+        q = _quat_wxyz(R[far])
+        w[far] = 2.0 * _turned(q[..., 1:], q[..., 0])
+    return w
 
 
 def so3_left_jacobian_inverse(w: ArrayLike) -> Array:

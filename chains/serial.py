@@ -20,7 +20,7 @@ CHUNK = 2048  # poses at once: what they need stays in a processor's own memory
 class Axes:
     """The joints' axes at K poses, in the frame that the chain starts from.
 
-    ``direction`` (K, M, 3) unit vectors; ``at_m`` (K, M, 3) a point of each axis; ``T`` (K, 4, 4)
+    ``direction`` (M, 3, K) unit vectors; ``at_m`` (M, 3, K) a point of each axis; ``T`` (K, 4, 4)
     of the chain's end; ``turns`` (M,) whether an axis turns, or else slides; ``by`` (J, M) how far
     each axis goes by each joint.
     """
@@ -31,15 +31,13 @@ class Axes:
     turns: Array
     by: Array
 
-    def velocities(self, points_m: Array) -> Array:
-        """Return how points (K, 3) behind all joints move, (K, J, 3) m per rad or m."""
-        across = np.cross(self.direction, points_m[:, None] - self.at_m)
-        return self.by @ np.where(self.turns[:, None], across, self.direction)
-
     def jacobian(self) -> Array:
         """Return the end's motion (K, 6, J), rotation over translation, in the start's axes."""
-        turn = self.by @ (self.direction * self.turns[:, None])
-        return np.concatenate([turn, self.velocities(self.T[:, :3, 3])], axis=2).mT
+        turn = self.direction * self.turns[:, None, None]
+        shift = cross(self.direction, self.T[:, :3, 3].T - self.at_m)
+        shift[~self.turns] = self.direction[~self.turns]
+        by_axis = np.concatenate([turn, shift], axis=1)
+        return np.ascontiguousarray(np.tensordot(self.by, by_axis, axes=1).transpose(2, 1, 0))
 
 
 class SerialChain:
@@ -72,7 +70,7 @@ class SerialChain:
         """Return T_start_end (K, 4, 4) at joints (K, J), rad or m, ordered as ``joint_names``."""
         T = np.empty((len(joints), 4, 4))
         for first in range(0, len(joints), CHUNK):
-            T[first : first + CHUNK] = self._end(self._walk(joints[first : first + CHUNK])[0])
+            T[first : first + CHUNK] = self._end(self._walk(joints[first : first + CHUNK]))
         return T
 
     def axes(self, joints: Array) -> Axes:
@@ -82,58 +80,65 @@ class SerialChain:
     def axes_and_points(
         self, joints: Array, edges: Sequence[int], points_m: Array
     ) -> tuple[Axes, Array]:
-        """Return where the axes are, and points (K, n, 3) given (n, 3) in what some edges (n,) lead
+        """Return where the axes are, and points (n, 3, K) given (n, 3) in what some edges (n,) lead
         to, counted from 1; 0 is the start."""
-        moved, found = self._walk(joints)
-        stacked = np.stack(found, axis=1) if found else np.zeros((len(joints), 0, 2, 3))
-        at_m = np.empty((len(joints), len(edges), 3))
+        moved = self._walk(joints)
+        at_m = np.empty((len(edges), 3, len(joints)))
         for n, (edge, point) in enumerate(zip(edges, points_m, strict=True)):
             axes, T = self.behind[edge]
             weights = np.append(T[:3, :3] @ point + T[:3, 3], 1.0)
-            at_m[:, n] = np.tensordot(weights, moved[axes], axes=1)
+            at_m[n] = np.tensordot(weights, moved[axes], axes=1)
         axes = Axes(
-            direction=stacked[:, :, 0],
-            at_m=stacked[:, :, 1],
+            direction=moved[1:, 2],  # as no motion along an axis, or about it, moves it
+            at_m=moved[1:, 3],
             T=self._end(moved),
             turns=self.turns,
             by=self.by,
         )
         return axes, at_m
 
-    def _end(self, moved: Sequence[Array]) -> Array:
+    def _end(self, moved: Array) -> Array:
         """Return T_start_end (K, 4, 4) from what `_walk` found."""
-        T = np.zeros((moved[-1].shape[1], 4, 4))
-        T[:, :3] = np.moveaxis(_after(moved[-1], self.fixed[-1]), 0, 2)
+        T = np.zeros((moved.shape[3], 4, 4))
+        T[:, :3] = _after(moved[-1], self.fixed[-1]).transpose(2, 1, 0)
         T[:, 3, 3] = 1.0
         return T
 
-    def _walk(self, joints: Array) -> tuple[list[Array], list[Array]]:
-        """Return where the start, and what each axis moves, is (4, K, 3), and every axis (K, 2, 3):
-        its direction and a point of it.
+    def _walk(self, joints: Array) -> Array:
+        """Return where the start, and what each axis moves, is (M + 1, 4, 3, K).
 
         Columns of T, not its rows, lie together: x, y, z and the origin.
         """
-        joints, count, found = joints @ self.by, len(joints), []
-        columns = np.zeros((4, count, 3))
-        columns[[0, 1, 2], :, [0, 1, 2]] = 1.0
-        moved = [columns]
-        cosine, sine = np.cos(joints.T)[..., None], np.sin(joints.T)[..., None]
+        by_axis = (joints @ self.by).T
+        moved = np.empty((len(self.fixed), 4, 3, len(joints)))
+        moved[0] = np.eye(4, 3)[..., None]
+        cosine, sine = np.cos(by_axis), np.sin(by_axis)
         for j, fixed in enumerate(self.fixed[:-1]):
-            columns = _after(columns, fixed)
-            found.append(columns[2:].swapaxes(0, 1))
-            x, y, z, origin = columns
+            x, y, z, origin = _after(moved[j], fixed, out=moved[j + 1])
             if self.turns[j]:
-                x, y = cosine[j] * x + sine[j] * y, cosine[j] * y - sine[j] * x
+                x_before = x.copy()
+                x *= cosine[j]
+                x += sine[j] * y
+                y *= cosine[j]
+                y -= sine[j] * x_before
             else:
-                origin = origin + joints[:, j, None] * z
-            columns = np.stack([x, y, z, origin])
-            moved.append(columns)
-        return moved, found
+                origin += by_axis[j] * z
+        return moved
 
 
-def _after(columns: Array, T: Array) -> Array:
-    """Return the columns (4, K, 3) of ``C @ T``, T (4, 4) being the same for all."""
-    out = (T[:3].T @ columns[:3].reshape(3, -1)).reshape(4, -1, 3)
+def cross(a: Array, b: Array) -> Array:
+    """Return the vector products (..., 3, K) of vectors whose components lie apart."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        out[..., k, :] = a[..., i, :] * b[..., j, :] - a[..., j, :] * b[..., i, :]
+    return out
+
+
+def _after(columns: Array, T: Array, out: Array | None = None) -> Array:
+    """Return the columns (4, 3, K) of ``C @ T``, T (4, 4) being the same for all."""
+    out = np.empty_like(columns) if out is None else out
+    np.matmul(T[:3].T, columns[:3].reshape(3, -1), out=out.reshape(4, -1))
     out[3] += columns[3]
     return out
 

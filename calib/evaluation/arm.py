@@ -196,7 +196,8 @@ class Arm:
         and move so by them (K, 6, n), least where more turns do, and shorter the more they are
         damped (K,)."""
         damping = damped * (np.square(off).sum(axis=1) / 2 + DAMPING * self._length_m**2)
-        square = J.mT @ J + damping[:, None, None] * np.eye(J.shape[2])
+        square = J.mT @ J
+        np.einsum("kii->ki", square)[:] += damping[:, None]
         return np.linalg.solve(square, np.vecmat(off, J)[..., None])[..., 0]
 
     def _off(
