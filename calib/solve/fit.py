@@ -12,6 +12,7 @@ from calib.problem.build import build, shape_steps
 from calib.problem.model import Model
 from calib.problem.problem import Block, Problem
 from calib.solve.added import declared
+from calib.solve.around import look_around
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, rest_of, values_of
 from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
@@ -73,7 +74,7 @@ def solve(
             loop.values |= loop.journal.answer(
                 loop.values, lambda: lidars_turned(loop.problem, loop.values)
             )
-            loop.lost = not loop.look_around()
+            loop.lost = not look_around(loop)
         if spread:
             loop.begin_spread()
         _arrive(loop, tolerance)

@@ -7,7 +7,6 @@ hopelessly far off. None of them is called converged.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -19,7 +18,6 @@ from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
-from calib.residuals.surfaces import MeshSurface
 from calib.solve.added import begun
 from calib.solve.components import squares, wider
 from calib.solve.components.told import sds, told
@@ -27,10 +25,9 @@ from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progr
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED_WEIGHT, reweighted
-from calib.solve.torn import CONTRADICTS, borne_out, doubted, torn
+from calib.solve.torn import doubted
 from chains import se3
 
-SETTLED_STEP = 1e-4  # m and rad: then triangles that beams meet are kept; a choice, 1 mm at 10 m
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
 STRAYED = 3e-3  # m and rad: a scan that moved further looks anew what its beams meet; a choice
 # By how much a step still lowers half the chi-square where the robust scales alone keep a fit from
@@ -49,21 +46,17 @@ BEFORE_SCANS = 2  # times: bodies are then a start for the scans, and no result
 # can be nine tenths of the one before there (four rods, one off: 0.7 sigma from the optimum after
 # ten times, 0.03 once changes are below a thousandth).
 REWEIGHTED, REWEIGHTED_ALONE = (10, SETTLED_WEIGHT), (200, 1e-3)
-# So often is looked what beams meet before it is asked whether that leads anywhere, and so often at
-# most; good recordings, and one with the LiDAR 0.13 m from where CAD has it, take 2 to 6 passes.
-# After so many, looks that leave MUCH of the cost, and weights that bring nothing, are given up.
-HOPEFUL, MOST_PASSES_LOOKED, MUCH = 8, 15, 0.9
-# How many sigmas wide the residuals of most stops may be by then: in those recordings it is 1 to 4,
-# with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where
-# a fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh
-# scaled), and 80 with the markers of all targets exchanged.
+# After so many rounds of weights it is asked whether these lead anywhere.
+HOPEFUL = 8
+# How many sigmas wide the residuals of most stops may be in the end: in good recordings 1 to 4,
+# with scans at wrong stops 85. And so wide may rows of trackers and targets be, as weighed, where a
+# fit has not settled: of the 90 kinds of damage it is 10 at most (a joint scaled, the mesh scaled),
+# and 80 with the markers of all targets exchanged.
 HOPELESS = 30.0
 # Relative change of a spread that is none; and one for which the passes to the optimum are not
 # worth doing again, as 50 members tell it no better.
 SETTLED_SPREAD, NEAR_SPREAD = 0.01, 0.1
 SPREAD = 8  # times: where rows do not scatter, each halves what they were thought to
-TIMES_ASKED = 2  # times: the first pass brings the LiDAR to where it is, near enough
-SCANS_OF_PLACE = 3  # scans of a place, for most of them to tell where the rig stood
 
 
 class Loop(Descent):
@@ -93,9 +86,9 @@ class Loop(Descent):
 
     def doubt_bodies(self) -> None:
         """Begin with next to no weight on the bodies of stops where one is grossly off."""
-        self._give(doubted(self.given, self.values))
+        self.give(doubted(self.given, self.values))
 
-    def _give(self, given: Problem) -> None:
+    def give(self, given: Problem) -> None:
         """Take a problem with other weights, or fewer scans, in place of that which was given."""
         if given is not self.given:
             self.given = self.problem = given
@@ -240,56 +233,6 @@ class Loop(Descent):
         """What beams meet now."""
         pairs = zip(self.problem.scans, self.associations, strict=True)
         return {key_of(scan): association.part for scan, association in pairs}
-
-    def look_around(self) -> bool:
-        """Passes that look each time anew what beams meet, until they settle; False where the fit
-        is hopeless, as where planes that were found in the scans never do. Where bodies contradict
-        each other, scans say which is right: as CAD has the LiDAR, and where a pass has put it."""
-        meshes, cost = any(isinstance(s.meeting, MeshSurface) for s in self.problem.scans), np.inf
-        for count in range(1, MOST_PASSES_LOOKED + 1):
-            if count <= TIMES_ASKED:
-                self._ask_scans()
-            self.linearise(associate=True)
-            self.passes += 1
-            scale = self.here.scale
-            if count <= TIMES_ASKED and self._set_aside(scale, count == TIMES_ASKED):
-                continue
-            if count > HOPEFUL and np.median(scale) > HOPELESS:
-                return False
-            tangent, _ = self.step()
-            self.values = self.moved(self.values, tangent)
-            if self.size(tangent) < SETTLED_STEP:
-                return True
-            if meshes and count >= HOPEFUL and self.cost() > MUCH * cost:
-                return bool(np.median(scale) <= HOPELESS)
-            cost = self.cost()
-        return meshes
-
-    def _ask_scans(self) -> None:
-        """Set aside the bodies that the scan at their stop shows to be wrong."""
-        wrong, stood = borne_out(self.given, self.values)
-        if wrong:
-            self.values |= stood
-            self._give(self.given.setting_aside(self.given.set_aside | wrong))
-            self.take_weights()
-
-    def _set_aside(self, scale: np.ndarray, torn_too: bool) -> bool:
-        """Leave scans out of the fit that contradict all others; whether there are any.
-
-        Args:
-            torn_too: also those of stops whose bodies contradict each other, once they were asked.
-            scale: (K,) how many sigmas wide the bulk of each scan's residuals is, where bodies, or
-                most scans of a place where the rig stood, say that the LiDAR is.
-        """
-        stood = Counter(scan.stops.root for scan in self.problem.scans)
-        told = {b.stops.root for b in self.problem.bodies}
-        told |= {root for root, count in stood.items() if count >= SCANS_OF_PLACE}
-        far = scale > CONTRADICTS * np.median(scale)
-        pairs = zip(self.problem.scans, far, strict=True)
-        gone = {s.group.token for s, is_far in pairs if is_far and s.stops.root in told}
-        gone -= set() if torn_too else {scan.group.token for scan in torn(self.problem)}
-        self._give(self.given.setting_aside(self.given.set_aside | gone))
-        return bool(gone)
 
     def settle(
         self,
