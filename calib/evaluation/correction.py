@@ -100,14 +100,17 @@ class Correction:
 
         Args:
             xyz_m: (N, 3), each a return.
-            columns: (N,) or (1,) of what effects may look at, beside what points say themselves.
+            columns: (N,) or (1,) of what effects may look at, beside what points say themselves;
+                ``range_m`` is NaN where a point's own is to be taken.
         """
         ray = beams(xyz_m, self.rig.lidar.beam_origin_m)
         error = np.zeros((len(xyz_m), 3))
         if "intensity" in columns:
             columns = {**columns, "intensity": columns["intensity"] / self.median_intensity}
+        met_m = columns.get("range_m", np.full(1, np.nan))
         for _ in range(CORRECTION_PASSES):
-            there = {"range_m": ray.range_m - error[:, 0], **_angles(ray), **columns}
+            range_m = np.where(np.isnan(met_m), ray.range_m - error[:, 0], met_m)
+            there = {**_angles(ray), **columns, "range_m": range_m}
             view = View(self.rig, len(xyz_m), there, np.zeros((1, 0)))
             each = (site_error(e.basis(view), theta) for e, theta in self.effects)
             error = sum(each, np.zeros((len(xyz_m), 3)))

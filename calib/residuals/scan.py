@@ -42,7 +42,7 @@ SIZE = {Site.BEAM: 3, Site.REFERENCE: 3, Site.NOISE: 1}
 # A measured spread of fewer sweeps than this leans on the datasheet: a choice; of so many, a sigma
 # is known to a sixth.
 PRIOR_COUNT = 20.0
-MET = ("label", "incidence_rad")
+MET = {"label": -1, "incidence_rad": np.nan}  # and what they are where nothing is met
 MET_PARTS = ("surface", "region", "patch", "plane")  # of what is met: no column of a user's
 # Of the variance of a patch of the reference, between its neighbouring points: a choice, as errors
 # of scans and planes are smooth.
@@ -219,13 +219,18 @@ class ScanStop:
 
     def what_meets(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
         """What is known (N,) of any beams of this stop: range, incidence and label of what they
-        meet, and (1,) the stop's own columns; of beams that meet nothing, their own range, an
-        incidence of NaN and label -1."""
+        meet, and (1,) the stop's own columns; of beams that meet nothing, or end so far from it
+        that a fit would reject them, a range and an incidence of NaN and label -1."""
         T = self.pose(values)
         surface = self.meeting.meet(T, ray, values, self._associate(T, ray, values, False))
-        columns = {n: c() if callable(c) else c for n, c in surface.columns.items() if n in MET}
-        columns["range_m"] = np.where(surface.usable, surface.predicted_m, ray.range_m)
-        columns["incidence_rad"] = np.where(surface.usable, columns["incidence_rad"], np.nan)
+        hit, met = np.flatnonzero(surface.usable), np.zeros(len(surface.usable), bool)
+        range_m, cosine = surface.predicted_m[hit], surface.cosine[hit]
+        sigma_m = np.sqrt(self.lidar.range_variance(range_m, cosine))
+        z = (ray.range_m[hit] - range_m) / np.hypot(sigma_m, self.reference_sigma_m / cosine)
+        met[hit] = tukey_weight(z, robust_scale(z)) > 0
+        known = {n: c() if callable(c) else c for n, c in surface.columns.items() if n in MET}
+        columns = {n: np.where(met, c, MET[n]) for n, c in known.items()}
+        columns["range_m"] = np.where(met, surface.predicted_m, np.nan)
         return {n: c for n, c in self.columns.items() if c.ndim == 1} | columns
 
     def _seen(

@@ -173,6 +173,29 @@ def test_of_its_own_recording_a_run_knows_the_mesh(fitted, tmp_path):
     assert (done.path / "rig.yaml").read_bytes() == (recording / "rig.yaml").read_bytes()
 
 
+def test_what_stands_before_the_mesh_is_corrected_by_its_own_range(tmp_path):
+    """Somebody at 1 m was taken for the wall 3 m behind him, in the run's own recording alone."""
+    recording = made(tmp_path / "rec", "tiny", 3, range_scale=3.0)[0].recording.folder
+    path = sorted((recording / "scans").iterdir())[0]
+    table = read_table(path)
+    xyz_m = np.stack([table[axis] for axis in "xyz"], axis=1)
+    near = xyz_m[:40] / np.linalg.norm(xyz_m[:40], axis=1, keepdims=True)
+    write_table(
+        path, table | {a: np.append(near[:, k], table[a][40:]) for k, a in enumerate("xyz")}
+    )
+    run = calibrate([recording], tmp_path / "run", Model(("range_scale",)))
+    shutil.copytree(recording, tmp_path / "copy")
+    own, loose = (
+        read_scan(apply(run, [some], tmp_path / out)[0].path / "scans" / path.name).xyz_m
+        for some, out in ((recording, "own"), (tmp_path / "copy", "loose"))
+    )
+    scale = run.solution.part(None).effects["range_scale"].estimate[0]
+    assert abs(scale) > 1e-3
+    np.testing.assert_allclose(own[:40], near / (1.0 + scale), atol=2e-6)
+    # A mixed pixel 50 mm before the mesh is not rejected, as ranges err by 10 mm here.
+    np.testing.assert_allclose(own, loose, atol=3e-4)
+
+
 def test_what_a_bare_cloud_does_not_tell_is_said(fitted, tmp_path):
     run = fitted[2]
     correction = Correction(fitted[0].rig, [(find("warmup_drift"), np.ones(1))])
