@@ -229,6 +229,20 @@ def test_a_worker_of_a_cluster_that_is_killed_changes_nothing(recording, tmp_pat
     assert written(here) == written(there)
 
 
+@pytest.mark.long
+def test_a_scheduler_that_ends_is_one_sentence(recording, tmp_path):
+    """It was waited for without end, or called an internal fault."""
+    folder = prepared(tmp_path / "here", recording)
+    with cluster() as found:
+        options = ("--hold-out", "none", "--scheduler", found.scheduler_address)
+        with fitting(folder, *options) as (process, _):
+            found.close()
+            _, err = process.communicate(timeout=LIMIT_S)
+    assert process.returncode == 2, err
+    assert "the scheduler has ended; what was done is kept" in err
+    assert "Traceback" not in err
+
+
 # ------------------------------------------------------------------------------- what is refused
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from calib.report.charts.residuals import _title
 from calib.report.statistics import Axis, StopResiduals, residual_statistics
 
 RINGS, AZIMUTHS = 8, 12
@@ -11,7 +12,11 @@ RNG = np.random.default_rng
 
 
 def table(
-    rng: np.random.Generator, stop: float, rows: int = 400, surfaces: int = 6
+    rng: np.random.Generator,
+    stop: float,
+    rows: int = 400,
+    surfaces: int = 6,
+    mean_m: float = 0.0,
 ) -> StopResiduals:
     """A stop of random rows; one in ten was thrown out by the fit."""
     weight = np.where(rng.random(rows) < 0.1, 0.0, rng.uniform(0.2, 1.0, rows))
@@ -21,7 +26,7 @@ def table(
         "range_m": rng.uniform(1.0, 6.0, rows),
         "incidence_rad": rng.uniform(0.0, 1.2, rows),
         "surface": rng.integers(0, surfaces, rows),
-        "residual_m": rng.normal(0.0, 0.002, rows),
+        "residual_m": rng.normal(mean_m, 0.002, rows),
         "sigma_m": rng.uniform(0.001, 0.003, rows),
         "weight": weight,
     }
@@ -162,3 +167,19 @@ def test_what_hangs_on_a_covariate_is_measured_without_what_chance_gives():
         sizes.append(gathered(bent, axis).curves["incidence_rad"].rms_m)
     assert sizes[0] < 0.0001
     np.testing.assert_allclose(sizes[1], 0.004, rtol=0.05)
+
+
+def test_a_curve_that_a_fit_has_absorbed_is_told_by_stops_held_out():
+    """Its title said that nothing is left, above a curve of 7 mm."""
+    rng, axis = RNG(5), Axis.of_values("incidence_rad", np.linspace(0, 1.2, 100), bins=10)
+    fitted, unseen = (
+        gathered([table(rng, float(k), rows=2000, mean_m=m) for k in range(8)], axis).curves[
+            axis.name
+        ]
+        for m in (0.0, 0.007)
+    )
+    title = _title("incidence_rad", fitted, None, unseen, "before")
+    off = f"{1e3 * unseen.rms_m:.2f}"  # 7 mm, less what chance adds
+    assert title == f"Over incidence, stops held out are off by {off} mm rms; the fit absorbs it"
+    title = _title("incidence_rad", fitted, None, fitted, "before")
+    assert title.startswith("No significant dependence on incidence is left")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import warnings
 from typing import Any
 
@@ -10,31 +11,76 @@ from calib.linear.parallel.crew import WorkerGoneError, serve
 from chains.errors import InputError
 
 SECONDS_TO_ANSWER = 20  # a choice: of a scheduler
+SECONDS_TO_WAIT = 5  # a choice: for an answer, before it is asked whether there are still workers
+
+log = logging.getLogger("rigcal")
+
+
+class Cluster:
+    """A cluster as its client sees it, and what was said of it.
+
+    Args:
+        client: of the cluster.
+        scheduler: its address.
+    """
+
+    def __init__(self, client: Any, scheduler: str) -> None:
+        self.client, self.scheduler, self.deserted = client, scheduler, False
+
+    def check(self) -> None:
+        """Say once that no worker is left, and once that one is back.
+
+        Raises:
+            InputError: the scheduler is gone.
+        """
+        try:
+            workers = self.client.nthreads() if self.client.status == "running" else None
+        except Exception:  # whatever Dask raises while a scheduler ends
+            workers = None
+        if workers is None:
+            raise InputError(
+                f"--scheduler {self.scheduler}: the scheduler has ended; what was done is kept: "
+                "give the command again, with another scheduler or without"
+            )
+        if self.deserted != (not workers):
+            self.deserted = not workers
+            state = "no worker is left; it goes on when one is" if self.deserted else "goes on"
+            log.warning("the cluster at %s: %s", self.scheduler, state)
 
 
 class ClusterLine:
     """The way to one thread of a worker, or to whoever takes its place.
 
     Args:
-        client: of the cluster.
+        cluster: of the worker.
         address: of the worker.
     """
 
-    def __init__(self, client: Any, address: str) -> None:
-        self.client, self.address, self.name = client, address, f"the worker {address}"
+    def __init__(self, cluster: Cluster, address: str) -> None:
+        self.cluster, self.address, self.name = cluster, address, f"the worker {address}"
 
     def ask(self, message: bytes) -> bytes:
         """Its answer to a message. Where it ends, Dask sends the message to another, which says
-        what it lacks."""
+        what it lacks.
+
+        Raises:
+            InputError: the scheduler is gone.
+        """
         from distributed import CancelledError, KilledWorker, TimeoutError
+        from distributed.client import ClosedClientError
 
         how = {"workers": [self.address], "allow_other_workers": True, "pure": False}
         try:
             with warnings.catch_warnings():  # a mesh in a message is large, and is sent once
                 warnings.simplefilter("ignore", UserWarning)
-                future = self.client.submit(serve, message, **how)
-            return future.result()
-        except (KilledWorker, CancelledError, TimeoutError, OSError) as error:
+                future = self.cluster.client.submit(serve, message, **how)
+            while True:
+                try:
+                    return future.result(timeout=SECONDS_TO_WAIT)
+                except TimeoutError:
+                    self.cluster.check()
+        except (KilledWorker, CancelledError, ClosedClientError, OSError) as error:
+            self.cluster.check()
             raise WorkerGoneError(f"ended ({type(error).__name__})") from None
 
     def renew(self) -> None:
@@ -42,7 +88,7 @@ class ClusterLine:
 
     def close(self) -> None:
         """Leave the cluster as it was."""
-        self.client.close()
+        self.cluster.client.close()
 
 
 def cluster_lines(scheduler: str) -> list[ClusterLine]:
@@ -58,6 +104,7 @@ def cluster_lines(scheduler: str) -> list[ClusterLine]:
         raise InputError(
             "--scheduler needs distributed, which is not installed; pip install 'rigcal[cluster]'"
         ) from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it raises is told
     try:
         client = Client(scheduler, timeout=SECONDS_TO_ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -71,7 +118,8 @@ def cluster_lines(scheduler: str) -> list[ClusterLine]:
     except BaseException:
         client.close()
         raise
-    return [ClusterLine(client, at) for at in sorted(threads) for _ in range(threads[at])]
+    cluster = Cluster(client, scheduler)
+    return [ClusterLine(cluster, at) for at in sorted(threads) for _ in range(threads[at])]
 
 
 def _version() -> str:

@@ -168,8 +168,8 @@ def _cells(figure: Figure, ax: Axes, rows: Sequence[Row], kinds: Sequence[str]) 
         text = f"{values[i, k]:.1f}" if values[i, k] >= LEAST_BITS else "0"
         colour = "white" if dark else plots.INK
         ax.text(k, i, text, ha="center", va="center", fontsize=8, color=colour)
-    labels = [f"without\n{SHORT_NAMES.get(kind, kind)}" for kind in kinds]
-    ax.set_xticks(range(len(kinds) + 1), [*labels, "by all,\nover CAD"], fontsize=8)
+    labels = [f"lost\nwithout\n{SHORT_NAMES.get(kind, kind)}" for kind in kinds]
+    ax.set_xticks(range(len(kinds) + 1), [*labels, "by all,\nbeyond\nCAD"], fontsize=8)
     ax.axvline(len(kinds) - 0.5, color=plots.PALE, linewidth=0.8)
     ax.grid(False)
     ax.tick_params(left=False)

@@ -37,6 +37,7 @@ BEAMS_IN_HISTOGRAM = 0.9  # of the beams rejected: what the histogram shows
 BEFORE_BEYOND = 5.0  # by how much what was before may lie beyond the scale of what is left
 MOST_AXIS_NAMES = 40  # names of things along an axis
 UPRIGHT_NAMES = 6  # of these; more are turned
+LEAST_SAID_M = 5e-6  # what two digits of mm show
 MARGINS = (0.72, 0.1, 0.5, 0.32)  # inches, for labels of four digits and a sign
 
 
@@ -46,11 +47,11 @@ def curves(evidence: Evidence) -> Iterator[Chart | Absent]:
         yield Absent("residual-…", NO_BEAMS)
         return
     for name, now in evidence.after.curves.items():
-        was = evidence.earlier.curves.get(name)
+        was, unseen = evidence.earlier.curves.get(name), _unseen(evidence, name)
         front = name in FRONT or "temperature" in name
         yield Chart(
             curve_id(name),
-            _title(name, now, was, evidence.before),
+            _title(name, now, was, unseen, evidence.before),
             "Mean residual (measured less predicted) before, now and of stops held out; now "
             "alone; and the scatter of single residuals. Bands are 95 % intervals of the mean, "
             "clustered by stop and surface; where one contains zero, no significant residual is "
@@ -101,24 +102,39 @@ def outside(curve: ResidualCurve) -> tuple[int, int, bool]:
     return out, int(known.sum()), bool(bdtrc(out - 1, known.sum(), 0.05) < BINS_OUT_BY_CHANCE)
 
 
-def _title(name: str, now: ResidualCurve, was: ResidualCurve | None, before: str) -> str:
+def _unseen(evidence: Evidence, name: str) -> ResidualCurve | None:
+    """The curve of the stops held out, where there are any."""
+    return evidence.held_out.curves.get(name) if evidence.held_out else None
+
+
+def _title(
+    name: str,
+    now: ResidualCurve,
+    was: ResidualCurve | None,
+    unseen: ResidualCurve | None,
+    before: str,
+) -> str:
     out, bins, hangs = outside(now)
     earlier = ""
     if was is not None:
         size_mm = 1e3 * was.rms_m
-        earlier = f"; {before}: {size_mm:.2f} mm rms" if size_mm >= 0.005 else f"; nor {before}"
+        left = was.rms_m >= LEAST_SAID_M
+        earlier = f"; {before}: {size_mm:.2f} mm rms" if left else f"; nor {before}"
     what = spoken(name)
     if not bins:
         return f"Nothing can be said of {what}: a single stop and surface"
     if hangs:
         return f"The residuals depend on {what}: {1e3 * now.rms_m:.2f} mm rms{earlier}"
+    if unseen is not None and outside(unseen)[2] and unseen.rms_m > now.rms_m + LEAST_SAID_M:
+        size_mm = 1e3 * unseen.rms_m
+        return f"Over {what}, stops held out are off by {size_mm:.2f} mm rms; the fit absorbs it"
     inside = f"{bins - out} of {bins} bins within their band"
     return f"No significant dependence on {what} is left ({inside}{earlier})"
 
 
 def _curve(evidence: Evidence, name: str) -> Figure:
     now, was = evidence.after.curves[name], evidence.earlier.curves.get(name)
-    unseen = evidence.held_out.curves.get(name) if evidence.held_out else None
+    unseen = _unseen(evidence, name)
     unit = evidence.joint_units.get(name) or shown_unit(name)
     names = now.axis.names or ()
     margins = None if len(names) > UPRIGHT_NAMES else MARGINS
