@@ -179,7 +179,7 @@ def refuse(
         for each in (target,) if anywhere else (target, *target.rglob("*")):
             # Also of an immutable file, which even root could neither replace nor remove.
             if os.path.exists(each) and not each.is_symlink() and not os.access(each, os.W_OK):
-                raise InputError(f"{each} is write-protected; lift that, or give another -o")
+                raise InputError(f"{each} is write-protected; lift that, or write elsewhere")
     except (OSError, RuntimeError) as error:  # the latter where links go round in a circle
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be written ({reason}); give another -o") from None

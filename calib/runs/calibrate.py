@@ -329,6 +329,7 @@ def _summary(
     return {
         "points": seen.count if estimate.scans else 0,
         "stops": sum(len(s.recording.stops) for s in problem.sources),
+        "scans": len(problem.scans),
         "residual": "range" if estimate.scans else OF_POSITIONS,
         "rms_mm": {
             "nominal": nominal.rms_mm,
