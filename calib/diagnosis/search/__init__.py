@@ -7,14 +7,13 @@ fitted and looked at again (detection, identification and adaptation: Teunissen 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.chance import Chance
-from calib.diagnosis.score import evidence
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
@@ -25,9 +24,9 @@ from calib.diagnosis.search.confirmed import (
     structures,
     suspects,
 )
-from calib.diagnosis.search.mishaps import adapted, restored
+from calib.diagnosis.search.mishaps import adapted, blunders_alone, restored
 from calib.diagnosis.search.named import NamedEffect, rivals_of
-from calib.diagnosis.search.parts import likeliest_part
+from calib.diagnosis.search.parts import in_place, likeliest_part
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.search.sways import Sways, sways
 from calib.diagnosis.stand import Look, Stand, tried
@@ -81,24 +80,6 @@ class Search:
         whole = step.candidate.test.statistic
         bins = (e for _, e in in_place(whole, step.before, step.after, common))
         return named < max(bins, default=0.0) - ODDS
-
-
-def in_place(
-    explained: float, before: Look, after: Look, common: float
-) -> Iterator[tuple[Candidate, float]]:
-    """Structure and its evidence in place of names: it explains no more than these do, and what
-    they leave it.
-
-    Args:
-        explained: by the names, in squared sigmas.
-        before, after: the looks without them and with them.
-        common: as of `ScoreTest.evidence`.
-    """
-    left = {c.effect.family: c.test.statistic for c in after.unnamed.candidates}
-    for candidate in before.unnamed.candidates:
-        most = explained + left.get(candidate.effect.family, np.inf)
-        statistic = min(candidate.test.statistic, most)
-        yield candidate, evidence(statistic, candidate.test.dof, common)
 
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
@@ -255,9 +236,10 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
     looks, and both, as `Search` has them. They end where values by chance lead at first; those that
     have `begun` so go on from there."""
     looks, found, left = map(list, begun or ([stand.look(progress)], [], []))
+    trial = True
     while True:
         before, mishaps = looks[-1], len(left)
-        looks[-1] = adapted(before, left, progress, named=bool(found))
+        looks[-1] = adapted(before, left, progress, bool(found), trial)
         wild = [each.blunder for each in left[mishaps:] if not each.aside]
         if len(found) < most and (more := _one_for_all(before, wild, found, progress)):
             del left[mishaps:]
@@ -267,9 +249,12 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
         if begun is None and not found and _chance_leads(looks[-1]):
             break
         more = _named(looks[-1], found, progress) if len(found) < most else found
-        if len(more) == len(found):
+        if len(more) > len(found):
+            looks, found = _left_behind([*looks, more[-1].after], more)
+        elif trial and mishaps == len(left) and blunders_alone(looks[-1], progress):
+            trial = False
+        else:
             break
-        looks, found = _left_behind([*looks, more[-1].after], more)
     if found:
         looks[-1], left, found = restored(stand, looks[-1], left, found, progress)
     return *_left_behind(looks, found), left

@@ -12,7 +12,12 @@ from calib.blunders.aside import stray_scans
 from calib.blunders.judged import Blunder, LeftOut
 from calib.blunders.shifts import standing_alone
 from calib.diagnosis.screen import ODDS
-from calib.diagnosis.search.confirmed import ALPHA_EFFECT, ALPHA_UNNAMED, stands_out
+from calib.diagnosis.search.confirmed import (
+    ALPHA_EFFECT,
+    ALPHA_UNNAMED,
+    stands_out,
+    structures,
+)
 from calib.diagnosis.search.named import NamedEffect
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.stand import Look, Stand, tried
@@ -25,13 +30,16 @@ ADAPTED, MENDED = 8, 2  # rounds of leaving out; of 76 fits without optimum one 
 AS_FAR = 0.1
 
 
-def adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) -> Look:
+def adapted(
+    look: Look, left: list[LeftOut], progress: Progress, named: bool, trial: bool = True
+) -> Look:
     """A look without the blunders that explain more than any effect or structure would, or leave
     these nothing to explain; they are added to those left out. Once an effect was `named`, no value
     of CAD is left out: lengths absorb part of an effect whose name is wrong.
 
     Several blunders at once may look like an effect: where one of them that an effect outdoes is
     left out, and the next then outdoes it, they are left out together if nothing stands out after.
+    Without such a `trial`, none of what stands out having been confirmed, they are left out anyway.
     """
     on_trial: tuple[Look, int] | None = None  # where to go back to, and how many were left out
     for _ in range(ADAPTED if look.stand.estimate.converged else MENDED):
@@ -40,13 +48,14 @@ def adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) ->
         wild = [] if stray else _wild(look)
         wild = [b for b in wild if not (named and b.group.kind == "frame")]
         groups = [each.blunder.group for each in stray] + [b.group for b in wild]
-        if not groups or (on_trial and wild and _outdone(look, wild[0])):
+        outdone = trial and bool(wild) and _outdone(look, wild[0])
+        if not groups or (on_trial and outdone):
             break
         if (stand := tried(look.stand.without, groups, progress)) is None:
             break
         after = stand.look(progress)
         quiet = _quiet(after)
-        if on_trial is None and wild and _outdone(look, wild[0]) and not quiet:
+        if on_trial is None and outdone and not quiet:
             on_trial = look, len(left)
         elif quiet:
             on_trial = None
@@ -56,6 +65,12 @@ def adapted(look: Look, left: list[LeftOut], progress: Progress, named: bool) ->
         look, count = on_trial
         del left[count:]
     return look
+
+
+def blunders_alone(look: Look, progress: Progress) -> bool:
+    """Whether there are blunders, and neither structure nor anything that scatters by chance."""
+    found = any(b.found for b in look.blunders) and not any(c.found for c in look.chance)
+    return found and not structures(look, progress)
 
 
 def _left_out(look: Look, wild: Sequence[Blunder], after: Look) -> Iterator[LeftOut]:

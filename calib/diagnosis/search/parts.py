@@ -7,6 +7,7 @@ of these joints, of fewer.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import comb
 
@@ -68,6 +69,24 @@ def likeliest_part(look: Look, candidate: Candidate, common: float) -> Explained
         best = int(np.argmax([part.evidence(common) if part.dof else -np.inf for part in each]))
         found, taken = [*found, each[best]], [*taken, joints.pop(best)]
     return max((p for p in found if p.dof), key=lambda part: part.evidence(common), default=whole)
+
+
+def in_place(
+    explained: float, before: Look, after: Look, common: float
+) -> Iterator[tuple[Candidate, float]]:
+    """Structure and its evidence in place of names: it explains no more than these do, and what
+    they leave it.
+
+    Args:
+        explained: by the names, in squared sigmas.
+        before, after: the looks without them and with them.
+        common: as of `ScoreTest.evidence`.
+    """
+    left = {c.effect.family: c.test.statistic for c in after.unnamed.candidates}
+    for candidate in before.unnamed.candidates:
+        most = explained + left.get(candidate.effect.family, np.inf)
+        statistic = min(candidate.test.statistic, most)
+        yield candidate, evidence(statistic, candidate.test.dof, common)
 
 
 def _explained(scores: Scores, columns: np.ndarray, price: float) -> Explained:

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from calib.diagnosis.screen import ODDS
-from calib.diagnosis.search import Search, in_place
+from calib.diagnosis.search import Search
+from calib.diagnosis.search.parts import in_place
 from calib.diagnosis.search.parts import Explained, likeliest_part
 from calib.diagnosis.verdict.matters import (
     ABSORBED,
