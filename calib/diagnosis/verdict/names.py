@@ -9,8 +9,7 @@ import numpy as np
 
 from calib.diagnosis.screen import ODDS
 from calib.diagnosis.search import Search
-from calib.diagnosis.search.parts import in_place
-from calib.diagnosis.search.parts import Explained, likeliest_part
+from calib.diagnosis.search.parts import Explained, in_place, likeliest_part
 from calib.diagnosis.verdict.matters import (
     ABSORBED,
     HELD_OUT_BESIDE_SCATTER,
