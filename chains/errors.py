@@ -17,6 +17,10 @@ class CutShortError(InputError):
     """What was asked was right, and something else ended it: the same command may go on later."""
 
 
+class NothingMetError(InputError):
+    """No beam of a scan meets a surface."""
+
+
 class NoColumnError(InputError):
     """A recording has not the column that an effect looks at."""
 

@@ -51,8 +51,7 @@ def _angle(w: Array) -> Array:
 
 
 def _turned(along: Array, cosine: Array) -> Array:
-    """Return (..., 3) along vectors (..., 3), which are as long as the sine of an angle that has
-    this cosine (...) to the same scale, others that are as long as the angle."""
+    """Return vectors (..., 3) of length k sin(a) scaled to length a, given k cos(a) (...)."""
     sine = _angle(along)
     some = np.where(sine > 0.0, sine, 1.0)  # where it is 0, so is the turn
     return (np.arctan2(sine, cosine) / some)[..., None] * along

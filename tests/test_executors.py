@@ -239,8 +239,9 @@ def test_a_scheduler_that_ends_is_one_sentence(recording, tmp_path):
             found.close()
             _, err = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2, err
-    assert "the scheduler has ended; what was done is kept" in err
+    assert "the scheduler has ended" in err and "for the same command to go on from" in err
     assert "Traceback" not in err
+    assert list(folder.glob(".run.rigcal/*"))
 
 
 # ------------------------------------------------------------------------------- what is refused

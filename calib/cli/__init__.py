@@ -14,7 +14,7 @@ import typer
 # BLAS threads on shared cores cost many times what they save; set before numpy is imported.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
-# Where memory is in pieces, the kernel spends more on making huge pages, as numpy asks for, than
+# Where memory is fragmented, the kernel spends more on making huge pages, as numpy asks for, than
 # they save: 5 of the 45 s of CPU time of a LiDAR's diagnosis, 1 of 10 s of that of 1,000 poses.
 os.environ.setdefault("NUMPY_MADVISE_HUGEPAGE", "0")
 # A look at many stops makes thousands of arrays, and hardly any objects that refer to each other.

@@ -33,7 +33,7 @@ from calib.residuals.spread import spread_rows
 from calib.residuals.store import BeamStore, SomeBeams, common_median, drawn_of_each
 from calib.residuals.surfaces import Meeting
 from chains import se3
-from chains.errors import InputError
+from chains.errors import InputError, NothingMetError
 from sensors.holds import spread_known
 from sensors.lidar import Beams, LidarModel
 from sensors.recording import RecordedStops, Scan
@@ -219,8 +219,8 @@ class ScanStop:
 
     def what_meets(self, ray: Beams, values: Values) -> dict[str, np.ndarray]:
         """What is known (N,) of any beams of this stop: range, incidence and label of what they
-        meet, and (1,) the stop's own columns; of beams that meet nothing, or end so far from it
-        that a fit would reject them, a range and an incidence of NaN and label -1."""
+        meet, and (1,) the stop's own columns; of beams that meet nothing, or whose raw ranges
+        would be rejected beside the others, a range and an incidence of NaN and label -1."""
         T = self.pose(values)
         surface = self.meeting.meet(T, ray, values, self._associate(T, ray, values, False))
         hit, met = np.flatnonzero(surface.usable), np.zeros(len(surface.usable), bool)
@@ -277,7 +277,7 @@ class ScanStop:
     ) -> Association:
         found = self.meeting.associate(T, ray, values, near_edges)
         if not (found.part >= 0).any():
-            raise InputError(
+            raise NothingMetError(
                 f"{self.recording.folder}: stop '{self.name}': none of its {len(found.part)} beams "
                 f"meets a surface; check the scan's units, the mesh's frame, and where the stop "
                 f"starts (base_guess, targets)"

@@ -377,6 +377,6 @@ def outcome(summary: Mapping[str, Any]) -> str:
     settled = "converged" if summary["converged"] else "NOT CONVERGED"
     points = f"{summary['points']} points at " if summary["points"] else ""
     scans = summary.get("scans", 0)
-    lacking = f", scans at {scans} of them" if 0 < scans < summary["stops"] else ""
+    scanned = f", scans at {scans} of them" if 0 < scans < summary["stops"] else ""
     passes = f"{settled} in {summary['iterations']} passes, {summary['seconds']:.0f} s"
-    return f"{points}{summary['stops']} stops{lacking}; {passes}"
+    return f"{points}{summary['stops']} stops{scanned}; {passes}"

@@ -57,3 +57,28 @@ def test_level_lidars_end_at_their_true_heights(tmp_path, world, sigma_m, deg):
     off = se3.log(se3.inverse(wanted) @ found)
     # Sigmas of 0.2 mm, along with what the LiDAR on its base, by CAD, leaves open.
     np.testing.assert_allclose(off[:, 3:], 0.0, atol=1.5e-3)
+
+
+def test_a_stop_that_the_tracker_missed_ends_where_it_was(tmp_path):
+    """The world has the tracker's axes here, and the beams tell least along the LiDAR's axis, which
+    the arm holds level."""
+    world = World(seed=2, locations=4, stops=5, beams=1500)
+    folder = tmp_path / "rec"
+    write(world, folder)
+    hardware = built(world, model(world.lidar))
+    stops = visited(world, hardware)
+    markers = se3.inverse(hardware.frames["base_markers"])
+    near = hardware.T_faro_opti @ stops.T_opti_body["base_markers"] @ markers
+    near[0, :3, 3] += 0.45, -0.1, 0.1
+    table = pd.read_csv(folder / "stops.csv")
+    table.loc[0, [name for name in table if "markers." in name]] = np.nan
+    table[GUESS] = np.concatenate([near[:, :3, 3], se3.to_quat_wxyz(near)], axis=1)
+    table.to_csv(folder / "stops.csv", index=False)
+    problem = build(
+        [Source.open(folder)], Model(("arm_link_length", "arm_joint_offset", "ring_range_offset"))
+    )
+    estimate = solve(problem)
+    assert estimate.converged and not estimate.problem.set_aside
+    found = np.array([scan.pose(estimate.values) for scan in estimate.scans])
+    off = se3.log(se3.inverse(stops.T_faro_lidar) @ found)
+    np.testing.assert_allclose(off[:, 3:], 0.0, atol=1.5e-3)

@@ -146,7 +146,7 @@ def test_figures_are_matplotlibs(plain):
     drawn = {
         text.get_text() for text in plain.plot("graph").findobj(lambda a: hasattr(a, "get_text"))
     }
-    assert {"lidar (6)", "ring_range_offset (32)", "without\ntracker"} <= drawn
+    assert {"lidar (6)", "ring_range_offset (32)", "lost\nwithout\ntracker"} <= drawn
     with pytest.raises(InputError, match="no figure"):
         plain.plot("ladders")
 

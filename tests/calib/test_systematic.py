@@ -12,8 +12,8 @@ from ..worlds import World, write
 
 @pytest.mark.long
 def test_half_of_a_mesh_that_is_6_mm_off_is_a_seam_and_no_scatter_of_the_targets(tmp_path):
-    """Mesh and spheres contradict each other systematically. With wider sigmas for both the room
-    slides away from where either has it, by decimetres, and no fit comes to an optimum."""
+    """Mesh and spheres contradict each other systematically; wider sigmas for both would leave the
+    room nowhere."""
     write(World(seed=11), tmp_path / "rec")
     seam_m = with_half_raised(tmp_path / "rec/reference/mesh.ply", 0.006)
     run = fit(tmp_path / "rec", tmp_path / "run", hold_out="none")

@@ -251,7 +251,8 @@ def _steps(stand: Stand, progress: Progress, most: int, begun: Steps | None = No
         more = _named(looks[-1], found, progress) if len(found) < most else found
         if len(more) > len(found):
             looks, found = _left_behind([*looks, more[-1].after], more)
-        elif trial and mishaps == len(left) and blunders_alone(looks[-1], progress):
+            trial = True
+        elif trial and len(found) < most and blunders_alone(looks[-1], progress):
             trial = False
         else:
             break

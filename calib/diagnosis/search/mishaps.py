@@ -39,7 +39,7 @@ def adapted(
 
     Several blunders at once may look like an effect: where one of them that an effect outdoes is
     left out, and the next then outdoes it, they are left out together if nothing stands out after.
-    Without such a `trial`, none of what stands out having been confirmed, they are left out anyway.
+    Where `trial` is False they are left out at once: what stood out was tried and not confirmed.
     """
     on_trial: tuple[Look, int] | None = None  # where to go back to, and how many were left out
     for _ in range(ADAPTED if look.stand.estimate.converged else MENDED):

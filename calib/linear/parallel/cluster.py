@@ -5,15 +5,19 @@ from __future__ import annotations
 import importlib.metadata
 import logging
 import warnings
+from threading import Lock
+from time import sleep
 from typing import Any
 
 from calib.linear.parallel.crew import WorkerGoneError, serve
-from chains.errors import InputError
+from chains.errors import CutShortError, InputError
 
 SECONDS_TO_ANSWER = 20  # a choice: of a scheduler
 SECONDS_TO_WAIT = 5  # a choice: for an answer, before it is asked whether there are still workers
 
-log = logging.getLogger("rigcal")
+SECONDS_BETWEEN = 0.2  # a choice: between looks whether a scheduler is back
+
+_LOG = logging.getLogger("rigcal")
 
 
 class Cluster:
@@ -25,27 +29,28 @@ class Cluster:
     """
 
     def __init__(self, client: Any, scheduler: str) -> None:
-        self.client, self.scheduler, self.deserted = client, scheduler, False
+        self.client, self.scheduler = client, scheduler
+        self.deserted, self._lock = False, Lock()
 
     def check(self) -> None:
-        """Say once that no worker is left, and once that one is back.
+        """Say when no worker is left, and when one is back.
 
         Raises:
-            InputError: the scheduler is gone.
+            CutShortError: the scheduler has ended.
         """
+        while self.client.status == "connecting":  # until it is back, or Dask gives up
+            sleep(SECONDS_BETWEEN)
+        if self.client.status != "running":
+            raise CutShortError(f"--scheduler {self.scheduler}: the scheduler has ended")
         try:
-            workers = self.client.nthreads() if self.client.status == "running" else None
-        except Exception:  # whatever Dask raises while a scheduler ends
-            workers = None
-        if workers is None:
-            raise InputError(
-                f"--scheduler {self.scheduler}: the scheduler has ended; what was done is kept: "
-                "give the command again, with another scheduler or without"
-            )
-        if self.deserted != (not workers):
-            self.deserted = not workers
-            state = "no worker is left; it goes on when one is" if self.deserted else "goes on"
-            log.warning("the cluster at %s: %s", self.scheduler, state)
+            deserted = not self.client.nthreads()
+        except Exception:  # whatever Dask raises where a connection breaks; the next ask sees it
+            return
+        with self._lock:
+            changed, self.deserted = deserted != self.deserted, deserted
+        if changed:
+            state = "no worker is left; it goes on when one is" if deserted else "goes on"
+            _LOG.warning("the cluster at %s: %s", self.scheduler, state)
 
 
 class ClusterLine:
@@ -64,7 +69,7 @@ class ClusterLine:
         what it lacks.
 
         Raises:
-            InputError: the scheduler is gone.
+            CutShortError: the scheduler has ended.
         """
         from distributed import CancelledError, KilledWorker, TimeoutError
         from distributed.client import ClosedClientError
@@ -76,9 +81,13 @@ class ClusterLine:
                 future = self.cluster.client.submit(serve, message, **how)
             while True:
                 try:
-                    return future.result(timeout=SECONDS_TO_WAIT)
+                    found = future.result(timeout=SECONDS_TO_WAIT)
                 except TimeoutError:
                     self.cluster.check()
+                    continue
+                if self.cluster.deserted:
+                    self.cluster.check()
+                return found
         except (KilledWorker, CancelledError, ClosedClientError, OSError) as error:
             self.cluster.check()
             raise WorkerGoneError(f"ended ({type(error).__name__})") from None
