@@ -1,4 +1,5 @@
-"""What of an effect explains most: all of it, or what one joint of the arm does, or a few.
+"""What of an effect explains most: all of it, or what one joint of the arm does, or a few; and what
+structure would explain in place of names.
 
 Joints wear, and are wired and zeroed, one by one: an effect with parameters for each of them is
 often that of one or two. At the price of all its parameters it would then lose against any function
