@@ -48,7 +48,7 @@ def guessed(folder, world, sigma_m, sigma_rad):
 )
 def test_level_lidars_end_at_their_true_heights(tmp_path, world, sigma_m, deg):
     """A floor that one beam in a hundred meets is all that tells these. It was rejected, and some
-    LiDARs ended up to 250 mm too high or low, in fits that were called converged."""
+    LiDARs ended up to 150 mm too high or low, in fits that were called converged."""
     wanted = guessed(tmp_path / "rec", world, sigma_m, np.radians(deg))
     problem = build([Source.open(tmp_path / "rec")], Model(("ring_range_offset",)))
     estimate = solve(problem)
