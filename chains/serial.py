@@ -6,7 +6,8 @@ derivative by every edge costs there.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -30,6 +31,11 @@ class Axes:
     T: Array
     turns: Array
     by: Array
+
+    def __getitem__(self, some: Array) -> Self:
+        """Return these at some of the poses."""
+        direction, at_m = self.direction[..., some], self.at_m[..., some]
+        return replace(self, direction=direction, at_m=at_m, T=self.T[some])
 
     def jacobian(self) -> Array:
         """Return the end's motion (K, 6, J), rotation over translation, in the start's axes."""
