@@ -32,14 +32,14 @@ def add_bodies(problem: Problem, part: SourceStops, places: Places) -> None:
         poses = start.body_poses(part.source, body)
         point = start.is_point(part.source, body)
         bases = {name: basis[:, b] for name, basis in here.bases.items()}
-        for (root, _), index in places.stops.items():
+        for key, index in places.stops.items():
             seen = index[np.isfinite(poses[index, 0, 3])]
             if not len(seen):
                 continue
             problem.blocks.append(
                 TrackedBody(
                     name=f"{body} at {recording.stops[seen[0]]}",
-                    stops=places.bind(root, seen),
+                    stops=places.of(key, seen),
                     body=body,
                     measured=poses[seen],
                     sigma_m=tracker.sigma_m,
@@ -63,7 +63,7 @@ def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
     blocks = [
         Level(
             name=f"{level_of(frame)} at {recording.stops[read[0]]}",
-            stops=places.bind(root, read),
+            stops=places.of(key, read),
             body=frame,
             measured=felt[read],
             gravity=GRAVITY,
@@ -75,7 +75,7 @@ def add_levels(problem: Problem, part: SourceStops, places: Places) -> None:
             ),
         )
         for frame, felt in recording.levels.items()
-        for (root, _), index in places.stops.items()
+        for key, index in places.stops.items()
         if len(read := index[np.isfinite(felt[index, 0])])
     ]
     turns = [block.seen(problem.initial).T[:, :3, :3] for block in blocks]

@@ -78,7 +78,7 @@ class Places:
         }
         for name, stops in self.groups.items():
             self._add_root(name, stops)
-        self._geometry = {key: self.bind(key[0], index) for key, index in self.stops.items()}
+        self._geometry = {key: self._bind(key[0], index) for key, index in self.stops.items()}
 
     def scanned(self) -> list[tuple[int, Stops]]:
         """The stops with a scan: number, and geometry."""
@@ -172,7 +172,12 @@ class Places:
         poses = (start.root_pose(self.part.source, [j]) for j in order)
         return next((T for T in poses if T is not None), None)
 
-    def bind(self, root: str, index: np.ndarray) -> Stops:
+    def of(self, key: tuple[str, int], some: np.ndarray) -> Stops:
+        """The geometry of some of the stops that stand under a key."""
+        whole = len(some) == len(self.stops[key])
+        return self._geometry[key] if whole else self._bind(key[0], some)
+
+    def _bind(self, root: str, index: np.ndarray) -> Stops:
         """The geometry of some stops that share a root."""
         source = self.part.source
         stops = self._all.some(index, root)
