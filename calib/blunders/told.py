@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -179,38 +180,64 @@ def of_recording(recording: str, other: str) -> dict[str, Any]:
     return {**found, "recording": recording}
 
 
+@dataclass(frozen=True)
+class Elsewhere:
+    """Where a part of the mesh is instead: so much farther (m) along the beams or its normal, with
+    the sigma of that, NaN where it is not known; and when, in words, if not at all stops."""
+
+    away_m: float
+    sigma_m: float
+    along: str = ALONG_BEAMS
+    when: str = ""
+
+    @property
+    def said(self) -> str:
+        """In words."""
+        size = size_told(abs(self.away_m), self.sigma_m, "m")
+        if self.along == ALONG_BEAMS:
+            return f"its beams read {size} {'long' if self.away_m > 0 else 'short'}"
+        return f"it stands {size} {'farther' if self.away_m > 0 else 'nearer'}"
+
+
 def of_part(
-    name: str, sources: Sequence[Source], off_m: tuple[float, float] | None, p: float
+    name: str, sources: Sequence[Source], off: Elsewhere | None, p: float
 ) -> dict[str, Any]:
     """A part of the mesh whose beams were rejected, in the same form.
 
     Args:
         name: as of `Group.what`.
         sources: the recordings.
-        off_m: where they agree on another place, the residual of its beams and the sigma of that,
-            NaN where it is not known.
+        off: where they agree on another place.
         p: by chance, all looks paid for.
     """
     group = Group("surface", MESH, name)
     at_m = _at_m(group, sources)
-    where, off = f"{group}{_about(at_m)}", {}
-    if off_m is None:
+    where, found = f"{group}{_about(at_m)}", {}
+    if off is None:
         said = f"beams do not end at {where}, but at all distances, as they do at glass or a mirror"
     else:
-        size, sigma = abs(off_m[0]), off_m[1]
-        off = {"size": size, "unit": "m", "sigma": sigma, "axis": ALONG_BEAMS}
-        beams = (
-            f"its beams read {size_told(size, sigma, 'm')} {'long' if off_m[0] > 0 else 'short'}"
-        )
-        said = f"{where} is not where it was scanned: {beams}"
+        found = {"size": abs(off.away_m), "unit": "m", "sigma": off.sigma_m, "axis": off.along}
+        when = f", {off.when}" if off.when else ""
+        said = f"{where} is not where it was scanned{when}: {off.said}"
     return {
         **_otherwise("surface", name, MESH, whole(said)),
-        **off,
+        **found,
         "at_m": at_m,
         "p_value": p,
         "p_adjusted": p,
         "without": group.token,
     }
+
+
+def of_many_parts(parts: Sequence[str]) -> dict[str, Any]:
+    """So many parts of the mesh that seem to have moved that it is not they that did, in the same
+    form; there is nothing to leave out."""
+    said = (
+        f"at some stops {len(set(parts))} parts of the mesh seem to stand elsewhere, among them "
+        f"{parts[0]} and {parts[1]}; so many move only if what carries the LiDAR does: was it "
+        "pushed, or is its place at some stops wrong?"
+    )
+    return _otherwise("surface", "", MESH, whole(said))
 
 
 def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:

@@ -43,8 +43,10 @@ def known_effects(
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
     """Whether a rig has the instrument, or the kind of joint, that an effect is about: an arm under
     a tracker alone lacks nothing of a LiDAR, a scanner or targets, and one without sliding joints
-    nothing of rails."""
+    nothing of rails. One that moves between all stops stands on nothing."""
     rigs = [s.rig for s in sources]
+    if effect.needs_standing:
+        return any(rig.lidar and rig.moves != "stop" for rig in rigs)
     if effect.site in (Site.BEAM, Site.NOISE) or effect.needs_lidar:
         return any(rig.lidar for rig in rigs)
     if effect.joint_kind:

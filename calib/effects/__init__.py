@@ -77,7 +77,16 @@ from calib.effects.range import (
     WarmupDrift,
 )
 from calib.effects.reference import FaroScale, MeshSeamX, MeshSeamY, MeshShift, MovedSurface
-from calib.effects.rig import FrameOffset, LidarSlip, MountCreep, MountSettle, MountSlip
+from calib.effects.rig import (
+    FrameOffset,
+    LidarSlip,
+    MountCreep,
+    MountSettle,
+    MountSlip,
+    StandCreep,
+    StandSettle,
+    StandSlip,
+)
 from calib.effects.scatter import (
     JointScatter,
     LocationRangeScatter,
@@ -152,6 +161,9 @@ CATALOGUE: tuple[Effect, ...] = (
     MountCreep(),
     MountSettle(),
     MountBending(),
+    StandSlip(),
+    StandCreep(),
+    StandSettle(),
     OptitrackScale(),
     OptitrackDistortion(),
     BodySlip(),

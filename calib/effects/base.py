@@ -142,6 +142,7 @@ class Effect(ABC):
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
         needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
+        needs_standing: True of one about rigs that stand still over several stops.
         of_members: True where its parameters are one quantity of several rings or labels, whose
             mean is a quantity as well.
         of_volume: True where it is the tracker's error at a place, which markers of targets have as
@@ -169,6 +170,7 @@ class Effect(ABC):
     finer: ClassVar[int] = 9
     joint_kind: ClassVar[str] = ""
     needs_lidar: ClassVar[bool] = False
+    needs_standing: ClassVar[bool] = False
     of_members: ClassVar[bool] = False
     of_volume: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False

@@ -7,6 +7,7 @@ import numpy as np
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import Creeps, Settles, Slips
 from calib.rig import Rig
+from chains import se3
 
 DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
 
@@ -119,6 +120,49 @@ class LidarSlip(MountSlip):
         own = rig.tree.path(lidar)[-1]
         beside = (b for b in bodies if mount in rig.tree.path(b) and own not in rig.tree.path(b))
         return own if own != mount and any(beside) else None
+
+
+class StandSlip(MountSlip):
+    """What the rig stands on moves once. A tripod is kicked, or a wheel gives way, where the rig is
+    taken to stand still over several stops; it stays there."""
+
+    name = "stand_slip"
+    needs_lidar = needs_standing = True
+    formula = "T_world_root = exp(theta) T_stood where t > t*, theta in the root's axes"
+    typical = "0.5 to 50 mm, 0.5 to 20 mrad, size assumed"
+    confounded_with = ("tracker_slip", "arm_joint_slip", "mount_slip")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        """None where every stop has a place of its own."""
+        return () if rig.moves == "stop" or not rig.lidar else self.moves()
+
+    def moved(self, view: View, by: np.ndarray) -> np.ndarray:
+        tree = view.rig.tree
+        basis = np.zeros((len(by), len(tree.edges), 6, 6))
+        for e, edge in enumerate(tree.edges):
+            if edge.parent == tree.root:
+                back = se3.adjoint(se3.inverse(edge.T_parent_child))
+                basis[:, e] = by[:, None, None] * back
+        return basis
+
+
+class StandCreep(Creeps, StandSlip):
+    """What the rig stands on gives way evenly in time. Per hour."""
+
+    name = "stand_creep"
+    unit, sigma = MountCreep.unit, MountCreep.sigma
+    formula = "T_world_root = exp(theta * t / 1 h) T_stood, t since the first stop"
+    typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
+    confounded_with = ("tracker_creep", "mount_creep", "stand_slip")
+
+
+class StandSettle(Settles, StandSlip):
+    """What the rig stands on settles. It moves fast at first, then ever more slowly."""
+
+    name = "stand_settle"
+    formula = "T_world_root = exp(theta * (1 - exp(-t / tau))) T_stood, t since the first stop"
+    typical = "0.1 to 1 mm, 0.05 to 0.5 mrad, size assumed; tripods and tyres settle"
+    confounded_with = ("stand_creep", "stand_slip", "tracker_settle")
 
 
 def mount_edges(rig: Rig) -> tuple[int, ...]:

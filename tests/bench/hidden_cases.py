@@ -81,7 +81,7 @@ SINGLES = tuple(
     e.name
     for e in CATALOGUE
     if e.site is not Site.NOISE and not e.by_chance and e.name not in _NOT_ALONE
-    if e.joint_kind != "prismatic"  # no rig of these has such a joint
+    if e.joint_kind != "prismatic" and not e.needs_standing  # no rig of these has or does so
 )
 # Their parameters have one unit, so that a size at which they are found means something.
 OF_ONE_UNIT = tuple(n for n in SINGLES if not find(n).shape_name and "creep" not in n)

@@ -101,7 +101,7 @@ def on_paper(world: World) -> dict[str, Any]:
             "sigma_joint_rad": SIGMA_JOINT_RAD,
         },
         "frames": frames,
-        "base": {"moves": "stop"},
+        "base": {"moves": "location" if world.stands else "stop"},
         "tracker": {
             "frame": "opti",
             "bodies": list(BODIES),

@@ -33,6 +33,11 @@ class World:
         warp_m: how far the middle of one wall is bowed out of the mesh's plane.
         uneven_m: standard deviation of how far surfaces lie off flat, smoothly; no mesh has it.
         meshed: numbers of the rectangles that the mesh has; empty for all of them.
+        shifted: of rectangles that stand elsewhere than the mesh has them, from a stop on: their
+            numbers, that of the stop, and by how much, m along the normal.
+        stands: whether the base stays where it is while it is at a location.
+        kicked: the number of a stop from which on the base stands elsewhere, by how much, m, along
+            each axis, and how far it is turned, rad, about each.
         clutter: share of the beams that hit boxes which are not in the mesh, about.
         turned: share of its range that each joint goes through, about its middle; 0 never turns.
         then: stops that follow: the number of a location, and what the encoders are to say there.
@@ -56,6 +61,9 @@ class World:
     warp_m: float = 0.0
     uneven_m: float = 0.0
     meshed: tuple[int, ...] = ()
+    shifted: tuple[tuple[int, ...], int, float] = ((), 0, 0.0)
+    stands: bool = False
+    kicked: tuple[int, float, float] = (0, 0.0, 0.0)
     clutter: float = 0.0
     turned: tuple[float, ...] = (1.0,) * 6
     then: tuple[tuple[int, tuple[float, ...]], ...] = ()

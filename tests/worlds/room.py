@@ -54,6 +54,12 @@ class Quads:
         mine, theirs = vars(self).items(), vars(other)
         return Quads(**{name: np.concatenate([each, theirs[name]]) for name, each in mine})
 
+    def shifted(self, some: tuple[int, ...], by_m: float) -> Quads:
+        """Some of them along their normals."""
+        corner = self.corner.copy()
+        corner[list(some)] += by_m * self.normal[list(some)]
+        return Quads(corner, self.u, self.v, self.label)
+
     def hit(self, start: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far (N,) m rays go until they meet a rectangle, and which (N,); inf and -1 if none.
 

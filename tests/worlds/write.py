@@ -76,8 +76,10 @@ def _scans(
         rng = world.rng(f"clutter {location}")
         more = room.cluttered(there, rng, world.clutter, T[:, :3, 3], towards)
         everything = there.and_(more)
+        some, first, by_m = world.shifted
         for k in at:
-            tables = scan(world, lidar, rig, everything, stops, k)
+            now = everything.shifted(some, by_m) if k >= first else everything
+            tables = scan(world, lidar, rig, now, stops, k)
             for table, folder in zip(tables, folders, strict=True):
                 if folder is not None:
                     pd.DataFrame(table).to_parquet(folder / f"{named[k]}.parquet", index=False)

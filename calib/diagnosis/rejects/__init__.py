@@ -19,7 +19,7 @@ the rest is looked at again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +27,10 @@ from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
 from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count, meshed
-from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
+from calib.diagnosis.rejects.found import CLUTTER, STRUCTURED_SHARE, Place, Rejects
+from calib.diagnosis.rejects.moved import WHOLE_SHARE, moved
 from calib.diagnosis.stand import Stand
-from calib.residuals.groups import REGION_PART, SURFACE
+from calib.residuals.groups import ALONG_BEAMS, MESH_PARTS, REGION_PART, SURFACE
 from calib.solve.fit import Progress
 
 ALPHA_REJECTED = LEVELS["structure of what was rejected"]
@@ -56,29 +57,27 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     if not stand.estimate.scans:
         return None
     counts = count(stand, progress)
-    left = np.ones(len(counts.rejected), bool)
-    places: list[Place] = []
-    told, least = np.zeros(len(left), bool), 1.0  # those of a place that says why
-    while len(places) < MOST_PLACES and len(counts.stop_names) >= FEWEST_STOPS:
-        found, p = _most(counts, left)
-        least = min(least, p)
-        if found is None:
-            break
-        inside, place = found
-        places.append(place)
-        left &= ~inside
-        told |= inside & (place.structured or place.in_the_way)
+    enough = len(counts.stop_names) >= FEWEST_STOPS
+    every, least = _places(counts) if enough else ([], 1.0)
+    structured = _any(counts, [inside for inside, place in every if place.structured])
+    parts = [*moved(counts, ~structured)] if enough else []
+    elsewhere = _any(counts, [some for _, some in parts])
+    every = [
+        (mine, place) for mine, place in every if not elsewhere[mine].mean() > STRUCTURED_SHARE
+    ]
+    in_the_way = _any(counts, [mine for mine, place in every if place.in_the_way])
+    places = [place for _, place in every]
     total = int(counts.met.sum())
-    rest = counts.rejected[left]
+    rest = counts.rejected[~_any(counts, [mine for mine, _ in every]) & ~elsewhere]
     crowded = _crowded(counts, rest)
     hit = float(crowded[rest.stop, rest.surface].sum()) / total
     apart = [place for place in places if place.structured]
     outside = 1.0 - sum(place.beams for place in apart)
-    usual = len(left) / total - sum(place.rejected for place in apart)
-    others = counts.rejected[~told]
+    usual = float((~elsewhere).sum()) / total - sum(place.rejected for place in apart)
+    others = counts.rejected[~(structured | elsewhere | in_the_way)]
     beyond = len(others) / total - hit > CLUTTER
     return Rejects(
-        share=len(left) / total,
+        share=len(counts.rejected) / total,
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
         p_adjusted=least,
         places=places,
@@ -87,7 +86,28 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
         beyond=beyond,
         beyond_m=float(np.median(others.residual_m)) if beyond and others.coherent else None,
+        moved=[part for part, _ in parts],
     )
+
+
+def _places(counts: Counts) -> tuple[list[tuple[np.ndarray, Place]], float]:
+    """Places, most of the rejected first, each with which of these (R,) it holds; and the smallest
+    p-value."""
+    found: list[tuple[np.ndarray, Place]] = []
+    left, least = np.ones(len(counts.rejected), bool), 1.0
+    while len(found) < MOST_PLACES:
+        next_one, p = _most(counts, left)
+        least = min(least, p)
+        if next_one is None:
+            break
+        found.append(next_one)
+        left &= ~next_one[0]
+    return found, least
+
+
+def _any(counts: Counts, some: Sequence[np.ndarray]) -> np.ndarray:
+    """Which of the rejected (R,) any of some sets (R,) holds."""
+    return np.any([np.zeros(len(counts.rejected), bool), *some], axis=0)
 
 
 @dataclass(frozen=True)
@@ -235,31 +255,24 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
     """What the rejected beams (R,) inside some cells (C,) of a covariate do."""
     rejected, total, beams = counts.rejected[inside], view.rows.sum(), view.rows[cells].sum()
     lower, upper = view.axis.interval(cells)
+    parts = view.axis.name in MESH_PARTS and counts.place_names
+    along = rejected.steadier if parts else ALONG_BEAMS
+    agreeing, share = rejected.along(along), len(rejected) / max(beams, 1)
     return Place(
         covariate=view.axis.name,
         lower=lower,
         upper=upper,
         names=view.axis.names_of(cells),
         p_adjusted=p,
-        share=len(rejected) / max(beams, 1),
+        share=share,
         rejected=len(rejected) / total,
         beams=beams / total,
-        residual_m=float(np.median(rejected.residual_m)),
-        sigma_m=_sigma(rejected.agreeing),
-        coherent=rejected.coherent,
+        residual_m=float(np.median(agreeing.residual_m)),
+        sigma_m=agreeing.sigma_m,
+        coherent=rejected.coherent or bool(parts and share > WHOLE_SHARE and agreeing.coherent),
         short=float(np.mean(rejected.residual_m < 0)),
+        along=along,
     )
-
-
-def _sigma(rejected: Rejected) -> float:
-    """Sigma of the mean of some residuals, m, stops and surfaces counted; NaN of a single one."""
-    away, variance = rejected.residual_m - rejected.residual_m.mean(), 0.0
-    for way in (rejected.stop, rejected.surface):
-        _, cluster = np.unique(way, return_inverse=True)
-        sums = np.bincount(cluster, away)
-        if (several := len(sums)) > 1:
-            variance += several / (several - 1) * np.sum(np.square(sums / len(away)))
-    return float(np.sqrt(variance)) or np.nan
 
 
 def _crowded(counts: Counts, rejected: Rejected) -> np.ndarray:

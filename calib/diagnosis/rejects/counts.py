@@ -14,6 +14,7 @@ from calib.forward import Values
 from calib.linear.parallel import over_stops
 from calib.linear.rows import PLACES
 from calib.residuals.beams import Association
+from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL
 from calib.residuals.robust import TUKEY
 from calib.residuals.scan import ScanStop
 from calib.solve.fit import Progress
@@ -121,6 +122,8 @@ class Rejected:
         stop, place, surface: (R,) numbers of the stop, the place and the surface they belong to.
         cells: (R, A) cell on each axis.
         residual_m: (R,); reach_m: (R,) by how much a beam may be off and not be rejected.
+        slant: (R,) cosine of the incidence: what is as far along the beam is so much nearer along
+            the normal.
     """
 
     stop: np.ndarray
@@ -129,6 +132,7 @@ class Rejected:
     cells: np.ndarray
     residual_m: np.ndarray
     reach_m: np.ndarray
+    slant: np.ndarray
 
     @classmethod
     def of(cls, parts: Sequence[Rejected]) -> Rejected:
@@ -142,6 +146,23 @@ class Rejected:
     def __len__(self) -> int:
         return len(self.stop)
 
+    def along(self, way: str) -> Rejected:
+        """The same, with distances along the beams, as they are, or along the normal of what these
+        were to meet."""
+        slant = self.slant if way == ALONG_NORMAL else 1.0
+        return replace(self, residual_m=self.residual_m * slant, reach_m=self.reach_m * slant)
+
+    @property
+    def steadier(self) -> str:
+        """Whether the beams or the normal is the way along which most differ less, by a part of
+        their median, from that."""
+        return min((ALONG_NORMAL, ALONG_BEAMS), key=lambda way: self.along(way)._unevenness)
+
+    @property
+    def _unevenness(self) -> float:
+        median = self._medians[0]
+        return float(np.median(np.abs(self.residual_m - median)) / max(abs(median), 1e-300))
+
     @property
     def coherent(self) -> bool:
         """Whether most would not be rejected were their median taken off, and not as well with the
@@ -153,6 +174,19 @@ class Rejected:
     def agreeing(self) -> Rejected:
         """Those that would not be rejected were the median taken off."""
         return self[np.abs(self.residual_m - self._medians[0]) < self.reach_m]
+
+    @property
+    def sigma_m(self) -> float:
+        """Sigma of the mean of those that agree, m, stops and surfaces counted; NaN where there is
+        one of them only."""
+        some, variance = self.agreeing, 0.0
+        away = some.residual_m - some.residual_m.mean()
+        for way in (some.stop, some.surface):
+            _, cluster = np.unique(way, return_inverse=True)
+            sums = np.bincount(cluster, away)
+            if (several := len(sums)) > 1:
+                variance += several / (several - 1) * np.sum(np.square(sums / len(away)))
+        return float(np.sqrt(variance)) or np.nan
 
     @property
     def _medians(self) -> tuple[float, float]:
@@ -289,6 +323,7 @@ def _count_stop(
         cells=at,
         residual_m=rows.residual_m[some],
         reach_m=TUKEY * rows.scale * rows.sigma_m[some],
+        slant=np.cos(np.broadcast_to(view["incidence_rad"], len(rows.usable))[some]),
     )
     return _Counted(
         places=places,

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from calib.blunders import told
+from calib.diagnosis.rejects.moved import MovedPart
 from calib.diagnosis.suggest import words
 from calib.problem.model import Source
-from calib.residuals.groups import MESH_PARTS, part_of_mesh
+from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL, MESH_PARTS, part_of_mesh
 from calib.rig.suspect import listed
 
 MOST_NAMED = 6  # stops or surfaces that a sentence names
+MOST_MOVED = 3  # parts of the mesh; where more seem to have moved, the rig has: a choice
 # Share of beams that makes a place structured, whatever their residuals do: a choice, ten times
 # what mixed pixels reach.
 STRUCTURED_SHARE = 0.5
@@ -43,7 +45,8 @@ class Place:
         p_adjusted: after all looks.
         share: rejected share of its beams; rejected: share of all beams that is rejected there.
         beams: share of all beams that is there.
-        residual_m: median residual of the rejected beams.
+        residual_m: median residual of the rejected beams; along: these, or the normal of a part of
+            the mesh, along which they agree better.
         sigma_m: of their mean, by stops and surfaces; NaN where there is one of them only.
         coherent: whether most would not be rejected were their median taken off, and not as well
             with the other sign.
@@ -62,6 +65,7 @@ class Place:
     sigma_m: float
     coherent: bool
     short: float
+    along: str = ALONG_BEAMS
 
     @property
     def structured(self) -> bool:
@@ -90,13 +94,19 @@ class Place:
     @property
     def what(self) -> str:
         """In words, what becomes of its beams."""
+        if self.coherent and self.along == ALONG_NORMAL:
+            return f"they end {self.size} mm {'before' if self.residual_m < 0 else 'behind'} it"
         if self.coherent:
-            side = "short" if self.residual_m < 0 else "long"
-            sigma = f" ± {1e3 * self.sigma_m:.2g}" if np.isfinite(self.sigma_m) else ""
-            return f"they read {1e3 * abs(self.residual_m):.1f}{sigma} mm {side}"
+            return f"they read {self.size} mm {'short' if self.residual_m < 0 else 'long'}"
         if self.in_the_way:
             return "they hit something that is nearer than the mesh"
         return "they scatter over all values"
+
+    @property
+    def size(self) -> str:
+        """Its median residual and the sigma of that, mm."""
+        sigma = f" ± {1e3 * self.sigma_m:.2g}" if np.isfinite(self.sigma_m) else ""
+        return f"{1e3 * abs(self.residual_m):.1f}{sigma}"
 
     def document(self) -> dict[str, Any]:
         """As in diagnosis.json: ends in the unit that is named."""
@@ -111,6 +121,7 @@ class Place:
             "sigma_mm": 1e3 * self.sigma_m,
             "share": self.share,
             "coherent": self.coherent,
+            "along": self.along,
             "p_adjusted": self.p_adjusted,
         }
 
@@ -146,6 +157,7 @@ class Rejects:
         meshed: whether surfaces are those of a mesh, and not planes found in the scans.
         clutter: share of all beams that hit something that is not in the mesh; clutter_stops: the
             stops of these.
+        moved: parts of the mesh that stand elsewhere, which no place tells.
         beyond: whether more is rejected elsewhere than mixed pixels may explain; beyond_m: the
             median residual of that, where it agrees on one.
     """
@@ -159,6 +171,7 @@ class Rejects:
     clutter_stops: tuple[str, ...]
     beyond: bool
     beyond_m: float | None
+    moved: Sequence[MovedPart] = ()
 
     @property
     def structured(self) -> Sequence[Place]:
@@ -172,18 +185,24 @@ class Rejects:
         mine = (place for place in self.structured if place.covariate in MESH_PARTS)
         return [place for place in mine if self.meshed and place.share > STRUCTURED_SHARE]
 
-    def blunders(self, sources: Sequence[Source]) -> list[dict[str, Any]]:
-        """These as blunders in diagnosis.json, to be left out; of these recordings."""
-        return [
+    def blunders(self, sources: Sequence[Source], alone: bool = True) -> list[dict[str, Any]]:
+        """What moved, and these where no effect was named that may explain them, as blunders in
+        diagnosis.json, to be left out; of these recordings."""
+        wrong = [
             told.of_part(
                 part_of_mesh(place.covariate, name),
                 sources,
-                (place.residual_m, place.sigma_m) if place.coherent else None,
+                told.Elsewhere(place.residual_m, place.sigma_m, place.along)
+                if place.coherent
+                else None,
                 place.p_adjusted,
             )
-            for place in self.wrong
+            for place in (self.wrong if alone else ())
             for name in place.names
         ]
+        if len({each.part for each in self.moved}) > MOST_MOVED:
+            return [*wrong, told.of_many_parts([each.part for each in self.moved])]
+        return [*wrong, *(each.blunder(sources) for each in self.moved)]
 
     @property
     def explained(self) -> bool:
@@ -202,6 +221,10 @@ class Rejects:
         for place in (self.structured or crowded)[:2]:
             there = f"of the beams at {place.where} it is {percent(place.share)} %"
             said += f"; {there}, and {place.what}"
+        if self.moved:
+            parts = listed(list(dict.fromkeys(each.part for each in self.moved)), MOST_NAMED)
+            share = percent(sum(each.rejected for each in self.moved))
+            said += f"; {share} % end at {parts}, elsewhere than the mesh has it"
         if self.clutter_stops:
             said += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
             said += listed(self.clutter_stops, MOST_NAMED)
@@ -229,6 +252,7 @@ class Rejects:
             "covariates": list(dict.fromkeys(p.covariate for p in self.structured)),
             "p_adjusted": self.p_adjusted,
             "where": [place.document() for place in self.places],
+            "moved": [each.document() for each in self.moved],
             "clutter": {"share": self.clutter, "stops": list(self.clutter_stops)},
             "explained": self.explained,
             "sentence": self.sentence,

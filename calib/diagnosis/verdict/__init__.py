@@ -216,7 +216,7 @@ def _blunders(
 ) -> list[Mapping[str, Any]]:
     """All that is wrong in the recordings; arguments as of `conclude`."""
     sources = found.looks[0].stand.sources
-    thrown = rejected.blunders(sources) if rejected and not found.found else ()
+    thrown = rejected.blunders(sources, alone=not found.found) if rejected else ()
     return [*plain, *thrown, *(told.document(left, sources) for left in found.blunders)]
 
 
