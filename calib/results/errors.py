@@ -9,14 +9,17 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from calib.forward import Values
 from calib.linear.parallel import over_stops
+from calib.linear.rows import TWIST
 from calib.problem import Problem
 from calib.problem.unknowns import Role
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import evaluated
+from calib.residuals.surfaces import PlaneSurface
 from calib.residuals.tracker import TrackedBody
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -206,12 +209,15 @@ class Foretold:
     """How well it is known where a stop stands that was predicted, and not fitted to its scan.
 
     Args:
-        twist: (6, 6) covariance of its LiDAR's right increment.
+        planes: name of the unknown of planes found in the scans, P numbers; "" with a mesh.
+        covariance: (6 + P, 6 + P) of the LiDAR's right increment, and of the planes: where neither
+            tracker nor mesh is there, all may be shifted together, and no beam reads otherwise.
         chance: unknown -> (n,) variances of what chance does anew to each stop or location, which
             no other tells.
     """
 
-    twist: np.ndarray
+    planes: str
+    covariance: np.ndarray
     chance: Mapping[str, np.ndarray]
 
     @classmethod
@@ -219,17 +225,28 @@ class Foretold:
         """By an estimate's marginals."""
         placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, predicted.values)
         names, known = list(placed.d), predicted.problem.variables
+        found = isinstance(scan.meeting, PlaneSurface) and scan.meeting.variable
+        planes = found if found and found in known else ""
         d = np.hstack([placed.d[name][0] for name in names])
+        if planes:
+            d = block_diag(d, np.eye(known[planes].dim))
+            names.append(planes)
         acting = (t.variable for t in scan.terms if t.variable in known)
         drawn = [name for name in acting if known[name].role is Role.SCATTER]
         return cls(
-            twist=d @ predicted.covariance_of(names) @ d.T,
+            planes=planes,
+            covariance=d @ predicted.covariance_of(names) @ d.T,
             chance={name: np.diag(predicted.covariance_of([name])) for name in drawn},
         )
 
     def variance_m2(self, rows: Rows) -> np.ndarray:
         """What that adds (N,) to what is expected of the residuals."""
-        out = np.einsum("ni,ij,nj->n", rows.by_twist, self.twist, rows.by_twist)
+        moves = np.zeros((len(rows.by_twist), len(self.covariance)))
+        moves[:, :TWIST] = rows.by_twist
+        for column in (c for c in rows.sparse if c.variable == self.planes):
+            met = np.flatnonzero(column.index >= 0)
+            moves[met, TWIST + column.components[column.index[met]]] = column.value[met]
+        out = np.einsum("ni,ni->n", moves @ self.covariance, moves)
         for column in rows.sparse:
             if column.variable in self.chance:
                 variance = self.chance[column.variable][column.components]
