@@ -16,6 +16,7 @@ from calib.problem.model import Source, labels, same_mesh
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
 from calib.rig import Rig
+from calib.rig.suspect import listed
 from sensors.rings import RingFinding
 
 SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
@@ -91,7 +92,7 @@ def document(left: LeftOut, sources: Sequence[Source]) -> dict[str, Any]:
         "indistinguishable_from": [other.token for other in left.rivals],
         "belongs_to": left.belongs.where if left.belongs else None,
         "without": group.token,
-        "sentence": _sentence(left, wrong_sign, _about(at_m)),
+        "sentence": _sentence(left, wrong_sign, _about(at_m), _mirrored(left, of)),
     }
 
 
@@ -306,7 +307,18 @@ def _about(at_m: Sequence[float] | None) -> str:
     return f" (about {', '.join(f'{m:.1f}' for m in at_m)} m)" if at_m else ""
 
 
-def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
+def _mirrored(left: LeftOut, source: Source) -> str:
+    """What may be off in place of a scan that seems to be, as the same rows say: where the tracker
+    alone tells where the rig stood, all bodies that it saw there, together. Empty if nothing."""
+    group, rig = left.blunder.group, source.rig
+    if group.kind != "scan" or left.aside or left.blunder.shift.of_ranges or rig.moves != "stop":
+        return ""
+    k, bodies = source.recording.stops.index(group.where), source.recording.bodies
+    seen = [body for body, poses in bodies.items() if np.isfinite(poses[k, 0])]
+    return f"{listed(seen, len(seen), ' and ')} together" if len(seen) > 1 else ""
+
+
+def _sentence(left: LeftOut, wrong_sign: str | None, about: str, mirrored: str) -> str:
     *size, axis = left.blunder.leading()
     told = axis.startswith(("about ", "along "))
     along = f" {axis}" if told else f" in {axis}" if axis else ""
@@ -327,8 +339,8 @@ def _sentence(left: LeftOut, wrong_sign: str | None, about: str) -> str:
     out = f"{group}{about} {verb} {off}"
     if left.belongs:
         return f"{out}: it was taken at {left.belongs.where}."
-    if left.rivals:
-        others = ", or ".join(map(str, left.rivals))
+    if rivals := [*map(str, left.rivals), *([mirrored] if mirrored else [])]:
+        others = ", or ".join(rivals)
         return f"{out}{sign}; or it is {others}: nothing measured here tells them apart."
     return f"{out}{sign}."
 

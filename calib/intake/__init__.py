@@ -134,7 +134,7 @@ def import_files(
         write_columns(folder / "stops.csv", _ordered(columns))
         if share:
             _check_names(columns["stop"].tolist())
-            scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
+            odd += scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
         rods, more = targets.join(gathered.spheres, gathered.tracks)
         odd += more
         if rods is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.intake.gather import finite_times
+from calib.rig.suspect import listed
 from chains.errors import InputError
 from sensors.readers.base import Progress, Sweep, Sweeps
 from sensors.recording import write_table
@@ -85,25 +86,32 @@ def one_lidar(sweeps: Sequence[Sweeps]) -> None:
             )
 
 
-def write(folder: Path, stops: Sequence[str], share: Share, progress: Progress) -> None:
-    """Write a scan for every stop that has turns, each with its number in `scan`.
+def write(folder: Path, stops: Sequence[str], share: Share, progress: Progress) -> list[str]:
+    """Write a scan for every stop that has points, each with the number of its turn in `scan`; what
+    looked odd.
 
     Raises:
-        InputError: as readers do while they decode.
+        InputError: no turn has any, or as readers do while they decode.
     """
     folder.mkdir()
     total = sum(int((stop >= 0).sum()) for _, stop in share)
-    held: list[Sweep] = []
-    last = -1
-    for done, (k, sweep) in enumerate(_in_turn(share)):
-        if k != last and held:
-            _write_one(folder, stops[last], held)
-            held = []
-        last = k
-        progress("writing scans", done, total)
-        held.append(sweep)
-    if held:
-        _write_one(folder, stops[last], held)
+
+    def told() -> Iterator[tuple[int, Sweep]]:
+        for done, each in enumerate(_in_turn(share)):
+            progress("writing scans", done, total)
+            yield each
+
+    empty = [
+        stops[k]
+        for k, turns in itertools.groupby(told(), key=lambda each: each[0])
+        if not _write_one(folder, stops[k], [sweep for _, sweep in turns])
+    ]
+    if empty and not any(folder.iterdir()):
+        raise InputError(
+            f"none of {total} turns of the LiDAR has a point: every return is missing, or nearer "
+            "than it measures; is it the model that the packets say?"
+        )
+    return [f"stop {listed(empty)}: turns without any point, so no scan"] if empty else []
 
 
 def _in_turn(share: Share) -> Iterator[tuple[int, Sweep]]:
@@ -117,7 +125,8 @@ def _first(stop: np.ndarray) -> int:
     return int(stop[stop >= 0].min(initial=np.iinfo(int).max))
 
 
-def _write_one(folder: Path, stop: str, sweeps: Sequence[Sweep]) -> None:
+def _write_one(folder: Path, stop: str, sweeps: Sequence[Sweep]) -> bool:
+    """Write the turns of a stop; whether they have any point."""
     names = set.intersection(*(set(sweep.points) for sweep in sweeps))
     points = {
         name: np.concatenate([sweep.points[name] for sweep in sweeps])
@@ -128,3 +137,4 @@ def _write_one(folder: Path, stop: str, sweeps: Sequence[Sweep]) -> None:
         points["scan"] = np.repeat(np.arange(len(sweeps), dtype=np.uint16), sizes)
     if len(points["x"]):
         write_table(folder / f"{stop}.parquet", points)
+    return len(points["x"]) > 0

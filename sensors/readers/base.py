@@ -68,12 +68,14 @@ class Sweeps:
         clock: as of a `Track`.
         time_s: (S,) middle of each turn; NaN where the file has no clock: then it is one stop.
         read: given which are wanted (S,) bool, yields those, one in memory at a time.
+        lost: share of its packets that are missing.
     """
 
     name: str
     clock: str
     time_s: Array
     read: Callable[[NDArray[np.bool_]], Iterator[Sweep]]
+    lost: float = 0.0
 
 
 @dataclass(frozen=True)

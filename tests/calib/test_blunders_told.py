@@ -75,3 +75,29 @@ def test_a_blunder_of_which_no_part_is_known_is_told_without_a_size(along, words
     source = SimpleNamespace(rig=SimpleNamespace(tree=None), reference=None)
     found = told.document(judged.LeftOut(far_out(shift), rivals=[]), [source])
     assert words in found["sentence"] and "against everything else" in found["sentence"]
+
+
+@pytest.mark.parametrize(
+    ("moves", "seen", "mirrored"),
+    [("stop", 2, True), ("stop", 1, False), ("location", 2, False)],
+)
+def test_a_scan_that_is_off_may_be_bodies_that_are(moves, seen, mirrored):
+    """Where the tracker alone says where the rig stood, it may have seen all of it elsewhere."""
+    shift = Shift(
+        group=Group("scan", "s1", "scan"),
+        statistic=400.0,
+        dof=1,
+        offset=np.array([4e-3]),
+        covariance=np.full((1, 1), 1e-8),
+        information=np.full((1, 1), 1e8),
+        axes=("x",),
+        units=("m",),
+    )
+    bodies = {f"b{k}": np.full((1, 7), 0.0 if k < seen else np.nan) for k in range(2)}
+    source = SimpleNamespace(
+        rig=SimpleNamespace(tree=None, moves=moves),
+        reference=None,
+        recording=SimpleNamespace(stops=("s1",), bodies=bodies),
+    )
+    found = told.document(judged.LeftOut(far_out(shift), rivals=[]), [source])
+    assert ("or it is b0 and b1 together: nothing" in found["sentence"]) == mirrored

@@ -132,7 +132,7 @@ def read_ouster(files: Sequence[Path], options: Options, progress: Progress) -> 
         raise InputError(f"{told[0]} is a sensor's metadata, and its PCAP is not given")
     if pcaps:
         capture = Capture(pcaps)  # no capture is a plainer mistake than no metadata
-        beside = options.metadata or (told[0] if told else _beside(pcaps[0]))
+        beside = options.metadata or (told[0] if told else _beside(capture.paths[0]))
         metadata = read_metadata(beside.name, read_text(beside))
         packets = capture_packets(capture, OusterDecoder(metadata).size, options)
         name, in_mb = capture.name, capture.progress(progress)

@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+import numpy as np
+
 from chains.errors import InputError
 from sensors.readers.base import Progress
 
@@ -30,6 +32,7 @@ _PCAP = {
     b"\x4d\x3c\xb2\xa1": ("<", 1e-9),
     b"\xa1\xb2\x3c\x4d": (">", 1e-9),
 }
+_SUFFIXES = (".pcap", ".pcapng", ".cap")
 _PCAPNG = b"\x0a\x0d\x0d\x0a"
 # Length of the link's own header, and where in it the type of what follows stands.
 _LINKS = {1: (14, 12), 113: (16, 14), 276: (20, 0)}
@@ -39,17 +42,23 @@ _LARGEST_DATAGRAM = 1 << 17  # twice what IPv4 can carry
 
 
 class Capture:
-    """Capture files that follow each other; iterating yields their `Datagram`s, anew each time.
+    """Capture files of one time after another, or folders of such; iterating yields their
+    `Datagram`s, anew each time.
 
-    Raises InputError where a file is missing, empty or no capture. `cut_short` has, once it was
-    iterated, the files that end within a packet, which is then left out.
+    Files are in the order of their first packets. Raises InputError where one is missing, empty or
+    no capture, and where a folder holds none. Once it was iterated, `cut_short` has the files that
+    end within a packet, which is then left out, and `back_s` by how much the clock was set back
+    at most.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self.paths = list(paths)
-        self.cut_short: list[Path] = []
-        for path in self.paths:
+        given = [file for path in paths for file in _files_of(path)]
+        for path in given:
             _check(path)
+        self.paths = sorted(given, key=_begins_s)
+        self.reordered = self.paths != given
+        self.cut_short: list[Path] = []
+        self.back_s = 0.0
         self._sizes = [path.stat().st_size for path in self.paths]
         self._read = 0
 
@@ -65,19 +74,45 @@ class Capture:
 
     def __iter__(self) -> Iterator[Datagram]:
         fragments: dict[bytes, dict[int, bytes]] = {}
-        self.cut_short = []
+        self.cut_short, self.back_s, last_s = [], 0.0, -np.inf
         for number, path in enumerate(self.paths):
             before = sum(self._sizes[:number])
             with open(path, "rb") as file:
-                frames = _pcapng if _magic(file) == _PCAPNG else _pcap
                 try:
-                    for time_s, link, frame in frames(path, file):
+                    for time_s, link, frame in _frames(path, file):
                         self._read = before + file.tell()
+                        self.back_s, last_s = max(self.back_s, last_s - time_s), time_s
                         packet = _ip_packet(link, frame)
                         if packet and (datagram := _udp(packet, fragments)):
                             yield Datagram(time_s, *datagram)
                 except _CutShortError:
                     self.cut_short.append(path)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The captures in a folder; of a file, itself."""
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in _SUFFIXES)
+    if not files:
+        raise InputError(
+            f"{path} is a folder without captures; they end in {' or '.join(_SUFFIXES)}"
+        )
+    return files
+
+
+def _begins_s(path: Path) -> float:
+    """When the first packet of a file was captured; the last of all times where it has none."""
+    with open(path, "rb") as file:
+        try:
+            return next(_frames(path, file), (np.inf,))[0]
+        except _CutShortError:
+            return np.inf
+
+
+def _frames(path: Path, file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
+    """Time [s], link type and frame of every packet, of either format."""
+    return (_pcapng if _magic(file) == _PCAPNG else _pcap)(path, file)
 
 
 def _check(path: Path) -> None:
@@ -98,7 +133,7 @@ def _magic(file: BinaryIO) -> bytes:
 
 
 def _pcap(path: Path, file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
-    """Time [s], link type and frame of every packet."""
+    """Those of libpcap's format."""
     head = _take(file, 24)
     order, unit_s = _PCAP[head[:4]]
     (link,) = struct.unpack_from(order + "I", head, 20)
@@ -115,7 +150,7 @@ def _pcap(path: Path, file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
 
 
 def _pcapng(path: Path, file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
-    """The same of enhanced packet blocks."""
+    """Those of enhanced packet blocks."""
     order, links = "<", []
     while head := file.read(8):
         if len(head) < 8:

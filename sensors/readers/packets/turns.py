@@ -25,6 +25,12 @@ Bytes = NDArray[np.uint8]
 
 _CHUNK = 2048
 """Packets decoded at once: bounds the memory, of the largest to some 50 MB."""
+_OVERTOOK_S = 1.0
+"""Packets that overtook each other in a network are never so late: a choice."""
+_USUAL_LOSS = 0.01
+"""Of all packets, from which it is told that some are missing: a choice."""
+_WHOLE_PERCENT = 90
+"""Of turns by their number of packets: the one that is taken to lack none."""
 _PAUSE_S = 0.3
 """No packet for longer than this: what comes next belongs to another turn."""
 
@@ -64,7 +70,16 @@ def packet_sweeps(
             yield Sweep(float(middle_s[s]), decoder.points(window, mine))
 
     middle_s = (time_s[first] + time_s[last]) / 2
-    return Sweeps(name, clock, middle_s, read)
+    return Sweeps(name, clock, middle_s, read, lost=_lost(first, last))
+
+
+def _lost(first: NDArray[np.int64], last: NDArray[np.int64]) -> float:
+    """Share of packets that are missing between the first turn and the last, as turns that are
+    whole have as many as each other."""
+    count = (last - first)[1:-1]
+    if not len(count):
+        return 0.0
+    return float(1.0 - count.mean() / np.percentile(count, _WHOLE_PERCENT))
 
 
 def steps_of_phase(difference: Array) -> NDArray[np.int64]:
@@ -128,12 +143,27 @@ def capture_packets(capture: Capture, size: int, options: Options) -> Packets:
 
 
 def captured(capture: Capture, contents: Contents) -> Contents:
-    """What was found in a capture, and whether it was cut short."""
-    if not capture.cut_short:
-        return contents
-    names = " and ".join(path.name for path in capture.cut_short)
-    said = f"{names} ends within a packet: it was cut short; what is whole is read"
-    return replace(contents, odd=(*contents.odd, said))
+    """What was found in a capture, and what is odd about its files."""
+    odd = list(contents.odd)
+    if capture.cut_short:
+        names = " and ".join(path.name for path in capture.cut_short)
+        odd.append(f"{names} ends within a packet: it was cut short; what is whole is read")
+    if capture.reordered:
+        names = ", ".join(path.name for path in capture.paths)
+        odd.append(f"captures are read in the order of their first packets: {names}")
+    if capture.back_s > _OVERTOOK_S:
+        odd.append(
+            f"{capture.name}: its clock was set back by {capture.back_s:.6g} s while it was"
+            " captured; times before and after do not follow each other: import the parts one by"
+            " one"
+        )
+    odd += [
+        f"{each.name}: {100 * each.lost:.2g} % of its packets are missing: the network or the "
+        "program that captured them lost them"
+        for each in contents.sweeps
+        if each.lost > _USUAL_LOSS
+    ]
+    return replace(contents, odd=tuple(odd))
 
 
 def stacked(payloads: list[bytes], size: int) -> Bytes:

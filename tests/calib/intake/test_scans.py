@@ -92,3 +92,24 @@ def test_targets_are_joined_by_name():
     assert found["upper_x"].tolist() == [1, 2, 3] and found["lower_z"].tolist() == [1, 1, 1]
     assert targets.join(spheres, points[:4])[0] is None
     assert targets.join(None, []) == (None, [])
+
+
+def test_turns_without_any_point_are_told_and_a_recording_of_them_is_refused(tmp_path):
+    """All returns were too near: the import ended well, with a folder of no scan."""
+
+    def emptied(one, some):
+        def read(wanted):
+            for k, sweep in zip(np.flatnonzero(wanted), one.read(wanted), strict=True):
+                none = {n: v[:0] for n, v in sweep.points.items()}
+                yield Sweep(sweep.time_s, none) if k in some else sweep
+
+        return Sweeps(one.name, one.clock, one.time_s, read)
+
+    each = turns([0.5, 2.5, 5.5])
+    share, _ = scans.by_time([emptied(each, {1})], SPANS)
+    assert scans.write(tmp_path / "some", STOPS, share, lambda *a: None) == [
+        "stop b: turns without any point, so no scan"
+    ]
+    share, _ = scans.by_time([emptied(each, {0, 1, 2})], SPANS)
+    with pytest.raises(InputError, match="none of 3 turns"):
+        scans.write(tmp_path / "none", STOPS, share, lambda *a: None)

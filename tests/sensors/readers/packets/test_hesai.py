@@ -222,3 +222,15 @@ def test_a_table_that_is_none_is_refused(text, tmp_path):
         read_angles(tmp_path / "t.csv")
     with pytest.raises(InputError, match="cannot be read"):
         read_angles(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(("lost", "told"), [(0, False), (1, False), (60, True)])
+def test_packets_that_are_missing_are_told(lost, told, tmp_path):
+    packets = turns("PandarXT-32", 20)
+    gone = np.random.default_rng(0).choice(np.arange(90, 420), lost, replace=False)
+    left = [(t, 2368, p) for k, (t, p) in enumerate(packets) if k not in gone]
+    found = read_hesai([write_pcap(tmp_path / "a.pcap", left)], Options(), quiet)
+    said = [each for each in found.odd if "packets are missing" in each]
+    assert bool(said) == told
+    share = float(said[0].split()[1]) / 100 if said else 0.0
+    assert not told or share == pytest.approx(lost / len(packets), rel=0.3)

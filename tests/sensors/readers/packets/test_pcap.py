@@ -85,3 +85,28 @@ def test_progress_is_of_all_files(tmp_path):
         progress("reading", 0, 0)
     assert told[0] == ("reading, MB", 0, 5) and told[-1] == ("reading, MB", 5, 5)
     assert [done for _, done, _ in told] == sorted(done for _, done, _ in told)
+
+
+def test_files_are_read_in_the_order_of_their_packets_whatever_their_names_say(tmp_path):
+    """part_10 comes before part_8 where a shell lists them: half of a hold was lost so."""
+    names = ("part_8", "part_9", "part_10")
+    parts = [
+        write_pcap(tmp_path / f"{name}.pcap", DATAGRAMS[3 * k : 3 * k + 3])
+        for k, name in enumerate(names)
+    ]
+    capture = Capture(sorted(parts))
+    assert same(list(capture)) and capture.reordered and capture.back_s == 0.0
+    assert not Capture(parts).reordered
+    (tmp_path / "notes.txt").write_text("no capture")
+    folder = Capture([tmp_path])
+    assert same(list(folder)) and folder.paths == parts
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="a folder without captures"):
+        Capture([tmp_path / "none"])
+
+
+def test_a_clock_that_is_set_back_is_seen(tmp_path):
+    moved = [(time_s - 3600 * (k > 4), *rest) for k, (time_s, *rest) in enumerate(DATAGRAMS)]
+    capture = Capture([write_pcap(tmp_path / "a.pcap", moved)])
+    assert len(list(capture)) == len(moved)
+    assert capture.back_s == pytest.approx(3600, abs=0.01)
