@@ -33,12 +33,12 @@ from calib.results.misfit import (
     misfit_by,
     redundancies,
 )
+from calib.results.observability import odd
 from calib.results.reach import reach
 from calib.results.rings import documents as odd_rings
 from calib.results.sigmas import misfit, widened
 from calib.results.solution import solution_of, up_of, zeros_of
 from calib.results.stages import FIT, staged
-from calib.rig.inventory import odd_numbers, odd_rig
 from calib.runs.belief import limits
 from calib.runs.reopen import (
     effects_of_prior,
@@ -265,7 +265,7 @@ def _fit(
     np.savez(folder / COVARIANCE, **arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
-    summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": _odd(sources)}
+    summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": odd(estimate)}
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
         summary |= since(links, before.summary)
@@ -286,11 +286,6 @@ def _fit(
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning
     write_yaml(folder / SOLUTION, solution.document(), warning)
-
-
-def _odd(sources: Sequence[Source]) -> list[str]:
-    """Which numbers of the recordings are hardly what they are taken for."""
-    return [said for s in sources for said in (*odd_rig(s.rig), *odd_numbers(s.rig, s.recording))]
 
 
 def _refuse_nothing(problem: Problem, seen: Errors) -> None:
