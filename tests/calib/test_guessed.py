@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate
 from calib.solve.fit import solve
+from calib.solve.loop import _beyond_doubt
 from chains import se3
 from tests.worlds import World, write
 from tests.worlds.beams import model
@@ -123,3 +125,18 @@ def test_exchanged_scans_of_a_room_without_a_mesh_are_told(tmp_path):
     (folder / "scan.parquet").rename(b)
     (said,) = calibrate([folder], tmp_path / "run", hold_out="none").summary["odd"]
     assert "L00P04, L00P09" in said and "another stop" in said
+
+
+@pytest.mark.parametrize(("moved_m", "tells"), [((0.02, 0, 0), False), ((0, 0.004, 0), True)])
+def test_along_a_corridor_scans_need_not_look_again(moved_m, tells):
+    """Walls at y = 1 m alone, with bumps of half a milliradian: 20 mm along them are 0.2 sigmas.
+    Scans drifted from look to look, and the fit was given up."""
+    rng = np.random.default_rng(0)
+    slope = np.column_stack([5e-4 * rng.standard_normal(1000), np.ones(1000), np.zeros(1000)])
+    rows = SimpleNamespace(
+        by_twist=np.hstack([np.zeros((1000, 3)), slope]),
+        sigma_m=np.full(1000, 1.5e-3),
+        weight=np.ones(1000),
+    )
+    scan = SimpleNamespace(rows=lambda values, met: rows)
+    assert _beyond_doubt({}, scan, None, np.array([0.0] * 3 + [*moved_m])) == tells
