@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -221,12 +222,12 @@ class Stops:
         """The same stops, with what their encoders misreport as one more unknown."""
         return replace(self, noise=variable)
 
-    @property
+    @cached_property
     def variables(self) -> tuple[str, ...]:
         """What places the rig in the world."""
         return (self.root, *self.edge_bases, *self.joint_bases, *self.own[1:])
 
-    @property
+    @cached_property
     def own(self) -> tuple[str, ...]:
         """Of those, what each stop may have for itself: its root, and its joint errors."""
         return (self.root,) if self.noise is None else (self.root, self.noise)

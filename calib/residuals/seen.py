@@ -141,7 +141,7 @@ class SeenBody(ABC):
         """(n, n) from the rows' axes at a stop to those in which people are told an offset."""
         return np.eye(len(self.axes))
 
-    @property
+    @cached_property
     def variables(self) -> tuple[str, ...]:
         return (*self.stops.variables, *self.bases, *(self.by_place.terms if self.by_place else ()))
 
