@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import effects
-from calib.effects import View, find
+from calib.effects import Effect, View, find
 from calib.forward import Term, place
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
+from calib.problem.places import standing
 from calib.residuals.targets import HangingTarget
 from calib.rig import Rig
 from calib.simulation import Spec
@@ -29,6 +30,7 @@ FLAWLESS = Spec(
     mixed_pixel_share=0,
     occluded_share=0,
 )
+STANDING = {effect.name for effect in effects.CATALOGUE if effect.needs_standing}
 STEEPEST_RAD = np.radians(80)
 
 
@@ -37,15 +39,22 @@ def coarse(rig: Rig) -> Rig:
     return replace(rig, lidar=replace(rig.lidar, quantum_m=0.02))
 
 
+def as_needed(rig: Rig, effect: Effect) -> Rig:
+    """The rig, or where an effect is about such, one that stands still at each location."""
+    return replace(rig, moves="location") if effect.needs_standing else rig
+
+
 def hide(folder: Path, name: str, size: float = 1.0, **fields: object) -> tuple[Source, dict]:
     """A recording with one effect hidden in flawless hardware, and its truth."""
+    stands = name.partition("@")[0] in STANDING
+    fields = {"base_moves": "location"} | fields if stands else fields
     return made(folder, changed(FLAWLESS, **fields), **{name: size})
 
 
-def every_column(folder: Path) -> tuple[Source, dict]:
+def every_column(folder: Path, **fields: object) -> tuple[Source, dict]:
     """A recording of flawless hardware with all columns that effects may look at, and its truth."""
     nothing = dict.fromkeys(("range_offset", "arm_payload_sag", "arm_torque_sag"), 0.0)
-    return made(folder, FLAWLESS, **nothing)
+    return made(folder, changed(FLAWLESS, **fields), **nothing)
 
 
 def stops_of(source: Source, **columns: np.ndarray) -> View:
@@ -67,8 +76,9 @@ def at_truth(source: Source, truth: dict, name: str) -> tuple[Problem, dict, np.
     T_opti_faro = np.linalg.inv(truth["T_faro_opti"])
     values = dict(problem.initial)
     values[source.rig.reference_frame] = T_opti_faro
+    where = dict(zip(source.recording.stops, standing(source), strict=True))
     for stop, at in truth["stops"].items():
-        values[f"root@{stop}"] = T_opti_faro @ np.array(at["T_faro_root"])
+        values[f"root@{where[stop]}"] = T_opti_faro @ np.array(at["T_faro_root"])
     for target in (b for b in problem.blocks if isinstance(b, HangingTarget) and name in b.tracked):
         values[target.gravity] = -T_opti_faro[:3, 2]
         (sphere,) = se3.apply(T_opti_faro, target.faro_m[None])

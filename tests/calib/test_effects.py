@@ -14,7 +14,7 @@ from calib.rig import load_rig
 from chains.errors import InputError
 
 from . import rigs
-from .hidden import coarse, every_column
+from .hidden import as_needed, coarse, every_column
 from .rescanned import rescanned
 
 
@@ -26,7 +26,7 @@ def problem(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory):
-    """What an effect sees at each site of a recording that has all that any effect looks at."""
+    """A function: what an effect sees at its site, of a recording with all that any looks at."""
     source, _ = every_column(tmp_path_factory.mktemp("views") / "rec")
     problem = build([source], Model())
     beams = problem.scans[-1].rows(problem.initial).view
@@ -34,11 +34,17 @@ def views(tmp_path_factory):
     count = len(source.recording.stops)
     stops = View(source.rig, count, source.columns, source.recording.joints)
     targets = View(source.rig, 4, {"target": np.arange(4)}, np.zeros((1, 0)))
-    return {
+    at = {
         **dict.fromkeys((Site.BEAM, Site.REFERENCE, Site.NOISE), beams),
         **dict.fromkeys((Site.JOINTS, Site.EDGE, Site.TRACKER), stops),
         Site.TARGET: targets,
     }
+
+    def seen(effect):
+        view = at[effect.site]
+        return replace(view, rig=as_needed(view.rig, effect))
+
+    return seen
 
 
 def shape(site, rig):
@@ -61,7 +67,7 @@ SHAPED = [effect for effect in effects.CATALOGUE if effect.joint_kind != "prisma
 
 @pytest.mark.parametrize("effect", SHAPED, ids=lambda e: e.name)
 def test_a_basis_has_the_shape_of_its_site(effect, views):
-    view = views[effect.site]
+    view = views(effect)
     params, basis = effect.params(view.rig), effect.basis(view)
     assert params and len({p.name for p in params}) == len(params)
     if isinstance(basis, OneHot):
@@ -86,7 +92,7 @@ def test_a_basis_has_the_shape_of_its_site(effect, views):
 def test_a_parameter_of_a_joint_moves_that_joint_alone(effect, views):
     """And none is of a joint because of its name: a gantry's may be called x and y, as are the two
     ways in which a foot tilts."""
-    view = views[effect.site]
+    view = views(effect)
     joints = np.array(view.rig.joint_names)
     about = np.array([p.joint for p in effect.params(view.rig)])
     if effect.site is Site.JOINTS:
@@ -106,9 +112,9 @@ def test_a_parameter_of_a_joint_moves_that_joint_alone(effect, views):
 def test_the_catalogue_says_what_an_effect_is(effect, views):
     assert effects.find(effect.name) is effect and effects.read(effect.document()) is effect
     assert effect.formula and effect.typical and effect.source
-    others = {e.name for e in effects.CATALOGUE} | {*views[Site.EDGE].rig.tree.edge_names, "faro"}
+    others = {e.name for e in effects.CATALOGUE} | {*views(effect).rig.tree.edge_names, "faro"}
     assert set(effect.confounded_with) <= others - {effect.name}
-    view = views[effect.site]
+    view = views(effect)
     units = dict.fromkeys(p.unit for p in effect.params(view.rig))
     assert effect.unit == ", ".join(units)
     assert set(effect.covariates) <= {*view.columns, "joints"}
@@ -144,11 +150,12 @@ def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     lidar, arm = bare
     unknown = {"label_range_offset", "range_quantisation"}
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
-    assert bool(effect.params(lidar)) == of_lidar
+    assert bool(effect.params(lidar)) == of_lidar or effect.needs_standing
     unknown = {"arm_gravity_sag", "arm_link_bending", "base_flex", "mount_bending"}
     unknown |= {"mount_slip", "mount_creep", "mount_settle", "lidar_slip"}
     unknown |= {"stop_pose_scatter"}  # of a LiDAR
     of_arm = effect.site in (Site.JOINTS, Site.EDGE) and effect.name not in unknown
+    of_arm &= not effect.needs_standing  # of a LiDAR, too
     assert bool(effect.params(arm)) == of_arm
 
 
@@ -250,4 +257,4 @@ def test_covariates_are_predicted_not_measured(problem):
 
 def test_an_absent_column_is_named_with_those_there(views):
     with pytest.raises(InputError, match=r"'moisture'.*temperature_c"):
-        views[Site.EDGE]["moisture"]
+        views(effects.find("base_flex"))["moisture"]

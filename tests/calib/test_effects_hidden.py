@@ -1,5 +1,7 @@
 """Every effect, hidden by the simulator, is what the fit's rows take it for."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from calib.solve.fit import solve
 from chains.errors import InputError
 
 from . import rigs
-from .hidden import at_truth, every_column, hide, residuals
+from .hidden import STANDING, at_truth, every_column, hide, residuals
 from .simulated import made, off_mesh
 
 # The noise of every LiDAR of the catalogue dithers its rounding away.
@@ -51,13 +53,19 @@ def test_what_is_hidden_is_what_the_rows_explain(tmp_path, name):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """A recording with nothing wrong."""
-    return every_column(tmp_path_factory.mktemp("whole") / "rec")
+    """A function: a recording with nothing wrong, of a rig that an effect can act on."""
+    folder = tmp_path_factory.mktemp("whole")
+
+    @cache
+    def of(moves):
+        return every_column(folder / moves, base_moves=moves)
+
+    return lambda name: of("location" if name in STANDING else "stop")
 
 
 @pytest.mark.parametrize("name", SHOWN)
 def test_rows_move_as_their_derivatives_say(whole, name):
-    source, truth = whole
+    source, truth = whole(name)
     truth = {**truth, "effects": {name: np.zeros(1000)}}
     problem, values, theta = at_truth(source, truth, name)
     term = next(t for t in problem.terms[0] if t.variable == name)
@@ -160,7 +168,7 @@ def test_an_effect_is_hidden_by_any_spelling(tmp_path):
     ids=lambda e: e.name,
 )
 def test_every_shape_to_try_is_another_effect(whole, effect):
-    source, truth = whole
+    source, truth = whole(effect.name)
     problem, values, _ = at_truth(
         source, {**truth, "effects": {effect.name: np.zeros(99)}}, effect.name
     )
@@ -186,7 +194,7 @@ def stops_of(source: Source) -> View:
 
 def test_a_slip_is_sought_between_stops(whole, tmp_path):
     (effect,) = load_effects("mount_slip")
-    stops = stops_of(whole[0])
+    stops = stops_of(whole(effect.name)[0])
     elapsed_s = stops["elapsed_s"]
     assert elapsed_s.min() == 0
     for when in effect.shapes(stops):

@@ -14,7 +14,7 @@ from calib.simulation import Spec, simulate
 from calib.simulation.room import build
 from calib.simulation.truth import draw, stream
 
-from .hidden import coarse
+from .hidden import as_needed, coarse
 from .simulated import BELOW_M, EXACT, changed, made, nominal, off_mesh, pose, rays, seen
 
 
@@ -224,7 +224,7 @@ ON_THIS_RIG = [effect for effect in CATALOGUE if effect.joint_kind != "prismatic
 
 @pytest.mark.parametrize("effect", ON_THIS_RIG, ids=lambda e: e.name)
 def test_every_effect_can_be_hidden_at_its_size(paper_rig, effect):
-    rig = coarse(paper_rig)
+    rig = as_needed(coarse(paper_rig), effect)
     truth = draw(rig, Spec(build_error=0), {effect.name: 3.0}, 1)
     ((hidden, theta),) = (pair for pair in truth.effects if pair[0].name == effect.name)
     sigma = np.array([p.sigma for p in hidden.params(rig)])
