@@ -226,7 +226,8 @@ class Rejects:
             share = percent(sum(each.rejected for each in self.moved))
             said += f"; {share} % end at {parts}, elsewhere than the mesh has it"
         if self.clutter_stops:
-            said += f"; {percent(self.clutter)} % hit something that is not in the mesh, at stop "
+            nowhere = "not in the mesh" if self.meshed else "on no plane found in the scans"
+            said += f"; {percent(self.clutter)} % hit something that is {nowhere}, at stop "
             said += listed(self.clutter_stops, MOST_NAMED)
         return said + "."
 
