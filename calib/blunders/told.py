@@ -234,11 +234,11 @@ def of_many_parts(parts: Sequence[str]) -> dict[str, Any]:
     """So many parts of the mesh that seem to have moved that it is not they that did, in the same
     form; there is nothing to leave out."""
     said = (
-        f"at some stops {len(set(parts))} parts of the mesh seem to stand elsewhere, among them "
-        f"{parts[0]} and {parts[1]}; so many move only if what carries the LiDAR does: was it "
-        "pushed, or is its place at some stops wrong?"
+        f"{len(parts)} parts of the mesh seem to stand elsewhere, among them {parts[0]} and "
+        f"{parts[1]}; so many move only if what carries the LiDAR does: was it pushed, or is its "
+        "place at some stops wrong?"
     )
-    return _otherwise("surface", "", MESH, whole(said))
+    return _otherwise("surface", "many parts", MESH, whole(said))
 
 
 def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:
@@ -292,7 +292,7 @@ def uneven(blunders: Iterable[Blunder]) -> list[str]:
 def tokens(blunders: Iterable[Mapping[str, Any]]) -> list[str]:
     """What ``--without`` takes, of blunders as diagnosis.json has them: of all that can be left
     out."""
-    return [each["without"] for each in blunders if each["without"]]
+    return list(dict.fromkeys(each["without"] for each in blunders if each["without"]))
 
 
 def _at_m(group: Group, sources: Sequence[Source]) -> list[float] | None:

@@ -128,15 +128,24 @@ class StandSlip(MountSlip):
 
     name = "stand_slip"
     needs_lidar = needs_standing = True
-    formula = "T_world_root = exp(theta) T_stood where t > t*, theta in the root's axes"
+    formula = "T_world_root = T_stood exp(theta) where t > t*, t since the first stop"
     typical = "0.5 to 50 mm, 0.5 to 20 mrad, size assumed"
     confounded_with = ("tracker_slip", "arm_joint_slip", "mount_slip")
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        """None where every stop has a place of its own."""
-        return () if rig.moves == "stop" or not rig.lidar else self.moves()
+        """None where every stop has a place of its own, and where an instrument is the root."""
+        if rig.moves == "stop" or not rig.lidar:
+            return ()
+        bodies = rig.tracker.bodies if rig.tracker else ()
+        levels = rig.levels.frames if rig.levels else ()
+        hang = all(rig.tree.path(frame) for frame in (rig.lidar_frame, *bodies, *levels))
+        return self.moves() if hang else ()
+
+    def edge(self, rig: Rig) -> None:
+        """No single one."""
 
     def moved(self, view: View, by: np.ndarray) -> np.ndarray:
+        """All that hangs from the root moves with it, each edge in its own axes."""
         tree = view.rig.tree
         basis = np.zeros((len(by), len(tree.edges), 6, 6))
         for e, edge in enumerate(tree.edges):
@@ -151,7 +160,7 @@ class StandCreep(Creeps, StandSlip):
 
     name = "stand_creep"
     unit, sigma = MountCreep.unit, MountCreep.sigma
-    formula = "T_world_root = exp(theta * t / 1 h) T_stood, t since the first stop"
+    formula = "T_world_root = T_stood exp(theta * t / 1 h), t since the first stop"
     typical = "0.05 to 0.5 mm per hour, size assumed; tripods and tyres settle"
     confounded_with = ("tracker_creep", "mount_creep", "stand_slip")
 
@@ -160,7 +169,7 @@ class StandSettle(Settles, StandSlip):
     """What the rig stands on settles. It moves fast at first, then ever more slowly."""
 
     name = "stand_settle"
-    formula = "T_world_root = exp(theta * (1 - exp(-t / tau))) T_stood, t since the first stop"
+    formula = "T_world_root = T_stood exp(theta * (1 - exp(-t / tau))), t since the first stop"
     typical = "0.1 to 1 mm, 0.05 to 0.5 mrad, size assumed; tripods and tyres settle"
     confounded_with = ("stand_creep", "stand_slip", "tracker_settle")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from sensors.readers.base import (
 )  # fmt: skip
 
 ARMS = ("urdf", "dh")  # read before all others, which look for the arm's joints
+USUAL_LOSS = 0.01  # of a LiDAR's packets, from which it is told: a choice
 TOLD_BY_FILE = ("bag", "hesai", "mesh", "ouster")  # which read --metadata
 PACKED = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".zst", ".tar")
 ROOMS = ("mesh", "spheres", "survey")  # what stood around; nothing of the rig
@@ -131,10 +132,11 @@ def gather(
         arm = arm and replace(arm, others=others)
         edges = chain(arm)
     contents = [*arms, *rest]
+    sweeps = [s for f in contents for s in f.sweeps]
     names = [kind for kind, _ in given]
     return Gathered(
         tracks=[_renamed(t, options.bodies) for f in contents for t in f.tracks],
-        sweeps=[s for f in contents for s in f.sweeps],
+        sweeps=sweeps,
         stops=_one_table([f.stops for f in contents if f.stops is not None], options.bodies),
         lidar=_one_lidar([f.lidar for f in contents if f.lidar is not None]),
         arm=arm,
@@ -142,9 +144,18 @@ def gather(
         surface=_only([f.surface for f in contents if f.surface], "hold a surface", names),
         spheres=_only([f.spheres for f in contents if f.spheres], "hold spheres", names),
         understood=[line for f in contents for line in f.understood],
-        odd=[line for f in contents for line in f.odd],
+        odd=[*(line for f in contents for line in f.odd), *_lossy(sweeps)],
         passive=passive,
     )
+
+
+def _lossy(sweeps: Sequence[Sweeps]) -> Iterator[str]:
+    """What is said of LiDARs of which packets are missing."""
+    for each in (each for each in sweeps if each.lost > USUAL_LOSS):
+        yield (
+            f"{each.name}: {100 * each.lost:.2g} % of its packets are missing: the network, or the "
+            "program that captured them, lost them"
+        )
 
 
 def _read(kind: str, files: Sequence[Path], options: Options, progress: Progress) -> Contents:

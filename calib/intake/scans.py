@@ -91,7 +91,7 @@ def write(folder: Path, stops: Sequence[str], share: Share, progress: Progress) 
     looked odd.
 
     Raises:
-        InputError: no turn has any, or as readers do while they decode.
+        InputError: no turn has any point, or as readers do while they decode.
     """
     folder.mkdir()
     total = sum(int((stop >= 0).sum()) for _, stop in share)

@@ -14,9 +14,10 @@ from calib.rig.suspect import listed
 from calib.solve.estimate import Estimate
 
 UNTOLD = 0.98  # of the prior's variance left: a choice; the data took 1 % off the prior's sigma
-# Of a scan's beams on planes, from which it sees a plane, and how many of them lie on planes that
-# no other sees where it is alone: choices. Of two exchanged scans it was 95 %, of others none.
-SEEN_SHARE, ALONE_SHARE = 0.05, 0.5
+# Of a scan's beams on planes: from which it sees a plane, up to which the others hardly do, and how
+# many of them lie on such planes where it is alone; choices. Of two exchanged scans it was 95 %, of
+# others none.
+SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # Of the leading parameter's share, in units of the priors, from which another is named beside it: a
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
@@ -42,8 +43,9 @@ def seen_alone(estimate: Estimate) -> list[str]:
         planes = max(part.max(initial=0) for part in parts) + 1
         beams = np.stack([np.bincount(part, minlength=planes)[1:] for part in parts])
         share = beams / np.maximum(beams.sum(axis=1, keepdims=True), 1)
-        own = np.count_nonzero(share > SEEN_SHARE, axis=0) < 2
-        alone = share[:, own].sum(axis=1) > ALONE_SHARE
+        others = np.sort(share, axis=0)[-2] if len(share) > 1 else np.ones(share.shape[1])
+        own = np.where((share > SEEN_SHARE) & (others < HARDLY_SEEN), share, 0.0)
+        alone = own.sum(axis=1) > ALONE_SHARE
         found += [estimate.scans[i].name for i, mine in zip(some, alone, strict=True) if mine]
     if not found:
         return []

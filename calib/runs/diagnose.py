@@ -141,8 +141,8 @@ def _answer(
     at_first = rejects(found.looks[0].stand, progress) if run.converged else None
 
     def beside_names() -> Rejects | None:
-        settled = at_first is None or (at_first.explained and not at_first.moved)
-        return at_first if settled or not found.found else rejects(found.looks[-1].stand, progress)
+        settled = not found.found or at_first is None or at_first.explained
+        return at_first if settled else rejects(found.looks[-1].stand, progress)
 
     rejected = beside_names()
     falls = _falls(found, stand, run, progress) if refits else {}

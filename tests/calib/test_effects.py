@@ -150,7 +150,7 @@ def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     lidar, arm = bare
     unknown = {"label_range_offset", "range_quantisation"}
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
-    assert bool(effect.params(lidar)) == of_lidar or effect.needs_standing
+    assert bool(effect.params(lidar)) == of_lidar
     unknown = {"arm_gravity_sag", "arm_link_bending", "base_flex", "mount_bending"}
     unknown |= {"mount_slip", "mount_creep", "mount_settle", "lidar_slip"}
     unknown |= {"stop_pose_scatter"}  # of a LiDAR

@@ -10,6 +10,8 @@ import pytest
 
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.residuals.surfaces import PlaneSurface
+from calib.results.observability import seen_alone
 from calib.runs.calibrate import calibrate
 from calib.solve.fit import solve
 from calib.solve.loop import _beyond_doubt
@@ -140,3 +142,24 @@ def test_along_a_corridor_scans_need_not_look_again(moved_m, tells):
     )
     scan = SimpleNamespace(rows=lambda values, met: rows)
     assert _beyond_doubt({}, scan, None, np.array([0.0] * 3 + [*moved_m])) == tells
+
+
+@pytest.mark.parametrize(
+    ("beams", "alone"),
+    [
+        ([[10] * 40] * 5, ()),  # planes of which none has much
+        ([[500, 500, 0, 0]], ()),  # nothing to compare it with
+        ([[500, 400, 0, 0], [400, 500, 0, 0], [0, 0, 600, 400]], ("s2",)),
+        ([[500, 400, 0, 0], [400, 500, 30, 0], [0, 0, 600, 400]], ()),  # another sees of it
+    ],
+)
+def test_a_scan_is_alone_where_no_other_sees_what_it_does(beams, alone):
+    room = PlaneSurface(planes=None, variable="planes")
+    estimate = SimpleNamespace(
+        scans=[SimpleNamespace(name=f"s{k}", meeting=room) for k in range(len(beams))],
+        associations=[
+            SimpleNamespace(part=np.repeat(np.arange(len(each)), each)) for each in beams
+        ],
+    )
+    said = "".join(seen_alone(estimate))
+    assert all(name in said for name in alone) and bool(said) == bool(alone)

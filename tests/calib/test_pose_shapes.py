@@ -19,6 +19,7 @@ from calib.simulation import Spec, simulate
 from ..bench.formulas_worlds import Case, written
 from ..mishaps import Scene
 from ..mishaps.scene import QUAT
+from .hidden import as_needed
 
 # Six numbers of a motion together are seen over a column in 30 stops or more.
 SPEC = Spec(
@@ -38,13 +39,14 @@ def rig(tmp_path_factory):
 
 @pytest.mark.parametrize("name", sorted(SLIPS))
 def test_each_wave_moves_what_the_slip_moves(rig, name):
+    rig = as_needed(rig, SLIPS[name])
     effect = PoseShape(SLIPS[name], "humidity", (0.2, 0.6), 2)
     humidity = np.array([0.2, 0.3, 0.4, 0.6, np.nan])
     tracked = np.tile(np.eye(4), (len(humidity), len(WHERE), 1, 1))
     columns = {"humidity": humidity, "tracked": tracked}
     view = View(rig, len(humidity), columns, np.zeros((len(humidity), len(rig.joint_names))))
     basis = effect.basis(view)
-    assert basis.shape[-1] == len(effect.params(rig)) == 12
+    assert basis.shape[-1] == len(effect.params(rig)) == 12 and effect.what in WHAT_MOVES
     whole = SLIPS[name].moved(view, np.ones(len(humidity)))
     first, second = np.split(basis, 2, axis=-1)
     angle = np.pi * np.array([0.0, 0.25, 0.5, 1.0])

@@ -27,7 +27,7 @@ from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
 from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count, meshed
-from calib.diagnosis.rejects.found import CLUTTER, STRUCTURED_SHARE, Place, Rejects
+from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.rejects.moved import WHOLE_SHARE, moved
 from calib.diagnosis.stand import Stand
 from calib.residuals.groups import ALONG_BEAMS, MESH_PARTS, REGION_PART, SURFACE
@@ -35,6 +35,9 @@ from calib.solve.fit import Progress
 
 ALPHA_REJECTED = LEVELS["structure of what was rejected"]
 MOST_PLACES = 4  # places that are told apart
+# Share of a place's rejected beams that parts of the mesh which moved hold, beyond which these are
+# told in its stead: a choice, most of them.
+MOSTLY_ELSEWHERE = 0.5
 FEWEST_STOPS = 4  # stops, below which nothing is claimed
 # Signs of the residuals that are counted.
 SIGNS_COUNTED = {
@@ -62,9 +65,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     structured = _any(counts, [inside for inside, place in every if place.structured])
     parts = [*moved(counts, ~structured)] if enough else []
     elsewhere = _any(counts, [some for _, some in parts])
-    every = [
-        (mine, place) for mine, place in every if not elsewhere[mine].mean() > STRUCTURED_SHARE
-    ]
+    every = [(mine, place) for mine, place in every if elsewhere[mine].mean() <= MOSTLY_ELSEWHERE]
     in_the_way = _any(counts, [mine for mine, place in every if place.in_the_way])
     places = [place for _, place in every]
     total = int(counts.met.sum())
@@ -257,7 +258,7 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
     lower, upper = view.axis.interval(cells)
     parts = view.axis.name in MESH_PARTS and counts.place_names
     along = rejected.steadier if parts else ALONG_BEAMS
-    agreeing, share = rejected.along(along), len(rejected) / max(beams, 1)
+    steady, share = rejected.along(along), len(rejected) / max(beams, 1)
     return Place(
         covariate=view.axis.name,
         lower=lower,
@@ -267,9 +268,9 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
         share=share,
         rejected=len(rejected) / total,
         beams=beams / total,
-        residual_m=float(np.median(agreeing.residual_m)),
-        sigma_m=agreeing.sigma_m,
-        coherent=rejected.coherent or bool(parts and share > WHOLE_SHARE and agreeing.coherent),
+        residual_m=float(np.median(steady.residual_m)),
+        sigma_m=steady.sigma_m,
+        coherent=rejected.coherent or bool(parts and share > WHOLE_SHARE and steady.coherent),
         short=float(np.mean(rejected.residual_m < 0)),
         along=along,
     )

@@ -204,6 +204,8 @@ class Counts:
         cells: per axis (C,) beams by cells.
         met: (K, S) beams of each stop on each surface.
         met_places: (K, P) the same at each place: a region of a surface of a mesh, or of a plane.
+        rank: (K,) which stop came when, by time if that is known of all, else by rows; NaN of
+            several recordings.
         stop_names, surface_names: by number; place_names: likewise, empty without a mesh.
         rejected: the rejected ones.
     """
@@ -214,6 +216,7 @@ class Counts:
     cells: Sequence[np.ndarray]
     met: np.ndarray
     met_places: np.ndarray
+    rank: np.ndarray
     stop_names: Sequence[str]
     surface_names: Sequence[str]
     place_names: Sequence[str]
@@ -254,11 +257,21 @@ def count(stand: Stand, progress: Progress) -> Counts:
         cells=cells,
         met=met,
         met_places=met_places,
+        rank=_rank(scans),
         stop_names=[scan.name for scan in scans],
         surface_names=[str(part) for _, part in surfaces.known],
         place_names=[str(part) for _, part in places.known] if meshed(stand) else [],
         rejected=Rejected.of(rejected),
     )
+
+
+def _rank(scans: Sequence[ScanStop]) -> np.ndarray:
+    first = scans[0].recording
+    if any(scan.recording is not first for scan in scans):
+        return np.full(len(scans), np.nan)
+    at = np.array([scan.index for scan in scans])
+    when = first.time_s if np.isfinite(first.time_s).all() else np.arange(len(first.stops))
+    return np.argsort(np.argsort(when[at], kind="stable"), kind="stable").astype(float)
 
 
 def meshed(stand: Stand) -> bool:

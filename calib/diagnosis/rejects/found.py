@@ -200,14 +200,19 @@ class Rejects:
             for place in (self.wrong if alone else ())
             for name in place.names
         ]
-        if len({each.part for each in self.moved}) > MOST_MOVED:
-            return [*wrong, told.of_many_parts([each.part for each in self.moved])]
+        if len(parts := self.moved_parts) > MOST_MOVED:
+            return [*wrong, told.of_many_parts(parts)]
         return [*wrong, *(each.blunder(sources) for each in self.moved)]
+
+    @property
+    def moved_parts(self) -> list[str]:
+        """Names of what moved; each once, though it may stand in two places."""
+        return list(dict.fromkeys(each.part for each in self.moved))
 
     @property
     def explained(self) -> bool:
         """Whether all that was rejected is what mixed pixels and clutter explain."""
-        return not self.structured and not self.beyond
+        return not self.structured and not self.beyond and not self.moved
 
     @property
     def sentence(self) -> str:
@@ -222,7 +227,7 @@ class Rejects:
             there = f"of the beams at {place.where} it is {percent(place.share)} %"
             said += f"; {there}, and {place.what}"
         if self.moved:
-            parts = listed(list(dict.fromkeys(each.part for each in self.moved)), MOST_NAMED)
+            parts = listed(self.moved_parts, MOST_NAMED)
             share = percent(sum(each.rejected for each in self.moved))
             said += f"; {share} % end at {parts}, elsewhere than the mesh has it"
         if self.clutter_stops:

@@ -37,7 +37,7 @@ class MovedPart:
     Args:
         part: as of `part_of_mesh`.
         stops: at which; none where at all that see it. since: whether at all from the first on.
-        away_m: how much farther than the mesh; sigma_m: of that, NaN of one stop.
+        away_m: how much farther than the mesh; sigma_m: of that.
         along: the beams, or the normal.
         rejected: share of all beams that is rejected there.
     """
@@ -93,14 +93,16 @@ def moved(counts: Counts, left: np.ndarray) -> Iterator[tuple[MovedPart, np.ndar
                 stops = np.unique(rejected.stop[some])
                 if len(stops) < FEWEST_MOVED:
                     continue
-                seen = np.flatnonzero(met[:, p] >= FEWEST_MET)
+                others = np.setdiff1d(np.flatnonzero(met[:, p] >= FEWEST_MET), stops)
+                stops = stops[np.argsort(counts.rank[stops], kind="stable")]
+                since = np.min(counts.rank[stops]) > np.max(counts.rank[others], initial=-1.0)
                 here = rejected[some].along(along)
                 left &= ~some
                 yield (
                     MovedPart(
                         part=part_of_mesh(kind, names[p]),
-                        stops=_names(counts, stops) if len(stops) < len(seen) else (),
-                        since=np.array_equal(stops, seen[-len(stops) :]) and len(stops) < len(seen),
+                        stops=tuple(counts.stop_names[i] for i in stops) if len(others) else (),
+                        since=bool(len(others) and since),
                         away_m=float(np.median(here.residual_m)),
                         sigma_m=here.sigma_m,
                         along=along,
@@ -120,12 +122,8 @@ def _agreeing(rejected: Rejected, mine: np.ndarray) -> Iterator[tuple[np.ndarray
     reach_m = np.median(by.reach_m)
     while at_m:
         near = max(
-            ([s for s, m in at_m.items() if abs(m - here) < reach_m] for here in at_m.values()),
+            ([s for s, m in at_m.items() if abs(m - here) <= reach_m] for here in at_m.values()),
             key=len,
         )
         yield mine & np.isin(rejected.stop, near), along
         at_m = {stop: m for stop, m in at_m.items() if stop not in near}
-
-
-def _names(counts: Counts, stops: np.ndarray) -> tuple[str, ...]:
-    return tuple(counts.stop_names[stop] for stop in stops)

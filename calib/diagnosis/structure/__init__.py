@@ -129,14 +129,16 @@ def formulas_of(slip: MountSlip, rig: Rig) -> tuple[tuple[str, Param], ...]:
     """Where formulas act that move what a slip moves, and for each its parameter."""
     moves = slip.params(rig)
     if slip.site is Site.EDGE and moves:
-        edge = rig.tree.edge_names[slip.edge(rig)]
-        return tuple((f"{edge}.{move.name}", move) for move in moves)
+        if (edge := slip.edge(rig)) is None:
+            return ()
+        return tuple((f"{rig.tree.edge_names[edge]}.{move.name}", move) for move in moves)
     # The tracker turns bodies about its own axes, and a formula acts in those of each body.
     return tuple((f"tracker:{move.name}", move) for move in moves if "." in move.name)
 
 
 def _moved(sources: Sequence[Source]) -> Iterator[PoseShape | PoseSlope]:
-    """Mount, tracked bodies and tracker, moved by every column that changes from stop to stop."""
+    """Mount, tracked bodies, tracker and what the rig stands on, moved by every column that changes
+    from stop to stop."""
     stops = sum(len(s.recording.stops) for s in sources)
     slips = [e for e in CATALOGUE if isinstance(e, MountSlip) and e.jumps]
     slips = [e for e in slips if any(e.params(s.rig) for s in sources)]

@@ -206,7 +206,7 @@ class OfPose(Effect):
 
     @property
     def what(self) -> str:
-        """What is moved: mount, body, base or tracker."""
+        """What is moved: mount, lidar, body, base, tracker or stand."""
         return self.slips.family.removesuffix("_slip")
 
 

@@ -25,6 +25,7 @@ WHAT_MOVES = {
     "body": "the tracked body beyond the arm moved",
     "base": "the tracked body before the arm moved",
     "tracker": "the tracker moved, or the place where the base stands",
+    "stand": "what the rig stands on moved",
     "elevation": "beams pointed higher or lower than they should",
     "azimuth": "beams pointed to the side of where they should",
 }

@@ -47,18 +47,18 @@ class Capture:
 
     Files are in the order of their first packets. Raises InputError where one is missing, empty or
     no capture, and where a folder holds none. Once it was iterated, `cut_short` has the files that
-    end within a packet, which is then left out, and `back_s` by how much the clock was set back
-    at most.
+    end within a packet, which is then left out, `back_s` by how much the clock was set back within
+    a file at most, and `overlap_s` by how much files overlap.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        given = [file for path in paths for file in _files_of(path)]
+        given = list(dict.fromkeys(file for path in paths for file in _files_of(path)))
         for path in given:
             _check(path)
         self.paths = sorted(given, key=_begins_s)
         self.reordered = self.paths != given
         self.cut_short: list[Path] = []
-        self.back_s = 0.0
+        self.back_s = self.overlap_s = 0.0
         self._sizes = [path.stat().st_size for path in self.paths]
         self._read = 0
 
@@ -74,14 +74,18 @@ class Capture:
 
     def __iter__(self) -> Iterator[Datagram]:
         fragments: dict[bytes, dict[int, bytes]] = {}
-        self.cut_short, self.back_s, last_s = [], 0.0, -np.inf
+        self.cut_short, self.back_s, self.overlap_s, last_s = [], 0.0, 0.0, -np.inf
         for number, path in enumerate(self.paths):
-            before = sum(self._sizes[:number])
+            before, first = sum(self._sizes[:number]), True
             with open(path, "rb") as file:
                 try:
                     for time_s, link, frame in _frames(path, file):
                         self._read = before + file.tell()
-                        self.back_s, last_s = max(self.back_s, last_s - time_s), time_s
+                        if first:
+                            self.overlap_s = max(self.overlap_s, last_s - time_s)
+                        else:
+                            self.back_s = max(self.back_s, last_s - time_s)
+                        first, last_s = False, time_s
                         packet = _ip_packet(link, frame)
                         if packet and (datagram := _udp(packet, fragments)):
                             yield Datagram(time_s, *datagram)

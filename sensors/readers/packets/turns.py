@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from chains.errors import InputError
 from sensors.readers.base import Array, Columns, Contents, Options, Progress, Sweep, Sweeps
@@ -27,10 +28,8 @@ _CHUNK = 2048
 """Packets decoded at once: bounds the memory, of the largest to some 50 MB."""
 _OVERTOOK_S = 1.0
 """Packets that overtook each other in a network are never so late: a choice."""
-_USUAL_LOSS = 0.01
-"""Of all packets, from which it is told that some are missing: a choice."""
-_WHOLE_PERCENT = 90
-"""Of turns by their number of packets: the one that is taken to lack none."""
+_ABOUT = 21
+"""Turns of which one at least is taken to lack no packet: a choice, two seconds at 10 Hz."""
 _PAUSE_S = 0.3
 """No packet for longer than this: what comes next belongs to another turn."""
 
@@ -70,16 +69,21 @@ def packet_sweeps(
             yield Sweep(float(middle_s[s]), decoder.points(window, mine))
 
     middle_s = (time_s[first] + time_s[last]) / 2
-    return Sweeps(name, clock, middle_s, read, lost=_lost(first, last))
+    return Sweeps(name, clock, middle_s, read, lost=_lost(time_s, turns))
 
 
-def _lost(first: NDArray[np.int64], last: NDArray[np.int64]) -> float:
-    """Share of packets that are missing between the first turn and the last, as turns that are
-    whole have as many as each other."""
-    count = (last - first)[1:-1]
+def _lost(time_s: Array, turns: _Turns) -> float:
+    """Share of packets that are missing from turns, as those that are whole have as many as others
+    about them; not of turns that a pause, or an end, has cut."""
+    first, last = turns.extent()
+    pause = np.flatnonzero(np.diff(time_s) > _PAUSE_S)
+    ends = np.concatenate([[0], pause, pause + 1, [len(time_s) - 1]])
+    whole = np.ones(len(first), bool)
+    whole[turns.here[ends]] = whole[turns.after[ends]] = False
+    count = (last - first + 1)[whole]
     if not len(count):
         return 0.0
-    return float(1.0 - count.mean() / np.percentile(count, _WHOLE_PERCENT))
+    return float(1.0 - count.sum() / maximum_filter1d(count, _ABOUT).sum())
 
 
 def steps_of_phase(difference: Array) -> NDArray[np.int64]:
@@ -151,18 +155,17 @@ def captured(capture: Capture, contents: Contents) -> Contents:
     if capture.reordered:
         names = ", ".join(path.name for path in capture.paths)
         odd.append(f"captures are read in the order of their first packets: {names}")
+    if capture.overlap_s > _OVERTOOK_S:
+        odd.append(
+            f"captures overlap by {capture.overlap_s:.6g} s: give those of one LiDAR that follow"
+            " each other"
+        )
     if capture.back_s > _OVERTOOK_S:
         odd.append(
             f"{capture.name}: its clock was set back by {capture.back_s:.6g} s while it was"
             " captured; times before and after do not follow each other: import the parts one by"
             " one"
         )
-    odd += [
-        f"{each.name}: {100 * each.lost:.2g} % of its packets are missing: the network or the "
-        "program that captured them lost them"
-        for each in contents.sweeps
-        if each.lost > _USUAL_LOSS
-    ]
     return replace(contents, odd=tuple(odd))
 
 

@@ -224,13 +224,21 @@ def test_a_table_that_is_none_is_refused(text, tmp_path):
         read_angles(tmp_path / "none.csv")
 
 
-@pytest.mark.parametrize(("lost", "told"), [(0, False), (1, False), (60, True)])
-def test_packets_that_are_missing_are_told(lost, told, tmp_path):
+@pytest.mark.parametrize("lost", [0, 1, 60])
+def test_packets_that_are_missing_are_counted(lost, tmp_path):
     packets = turns("PandarXT-32", 20)
     gone = np.random.default_rng(0).choice(np.arange(90, 420), lost, replace=False)
     left = [(t, 2368, p) for k, (t, p) in enumerate(packets) if k not in gone]
-    found = read_hesai([write_pcap(tmp_path / "a.pcap", left)], Options(), quiet)
-    said = [each for each in found.odd if "packets are missing" in each]
-    assert bool(said) == told
-    share = float(said[0].split()[1]) / 100 if said else 0.0
-    assert not told or share == pytest.approx(lost / len(packets), rel=0.3)
+    (sweeps,) = read_hesai([write_pcap(tmp_path / "a.pcap", left)], Options(), quiet).sweeps
+    assert sweeps.lost == pytest.approx(lost / len(packets), rel=0.3)
+
+
+def test_turns_that_a_pause_cuts_lack_nothing(tmp_path):
+    """A capture for each hold: each begins and ends within a turn."""
+    packets = turns("PandarXT-32", 9)[13:-13]
+    parts = [
+        write_pcap(tmp_path / f"hold_{k}.pcap", [(t + 10.0 * k, 2368, p) for t, p in packets])
+        for k in range(6)
+    ]
+    (sweeps,) = read_hesai(parts, Options(), quiet).sweeps
+    assert sweeps.lost == 0.0

@@ -109,4 +109,12 @@ def test_a_clock_that_is_set_back_is_seen(tmp_path):
     moved = [(time_s - 3600 * (k > 4), *rest) for k, (time_s, *rest) in enumerate(DATAGRAMS)]
     capture = Capture([write_pcap(tmp_path / "a.pcap", moved)])
     assert len(list(capture)) == len(moved)
-    assert capture.back_s == pytest.approx(3600, abs=0.01)
+    assert capture.back_s == pytest.approx(3600, abs=0.01) and capture.overlap_s == 0.0
+
+
+def test_files_that_overlap_are_no_clock_that_was_set_back(tmp_path):
+    data = [(float(k), 7, b"x" * 50) for k in range(10)]
+    paths = [write_pcap(tmp_path / "a.pcap", data), write_pcap(tmp_path / "b.pcap", data[2:])]
+    capture = Capture([*paths, tmp_path / "a.pcap"])
+    assert len(list(capture)) == 18 and capture.back_s == 0.0
+    assert capture.overlap_s == pytest.approx(7.0)
