@@ -230,15 +230,28 @@ def of_part(
     }
 
 
-def of_many_parts(parts: Sequence[str]) -> dict[str, Any]:
-    """So many parts of the mesh that seem to have moved that it is not they that did, in the same
-    form; there is nothing to leave out."""
+def of_many_parts(parts: Sequence[str], when: str) -> dict[str, Any]:
+    """So many parts of the mesh that seem to have moved that it may not be they that did, in the
+    same form; there is nothing to leave out.
+
+    Args:
+        parts: as of `Group.what`.
+        when: of the first, as of `Elsewhere`.
+    """
+    since = f", {parts[0]} {when}" if when else ""
     said = (
-        f"{len(parts)} parts of the mesh seem to stand elsewhere, among them {parts[0]} and "
-        f"{parts[1]}; so many move only if what carries the LiDAR does: was it pushed, or is its "
-        "place at some stops wrong?"
+        f"{len(parts)} parts of the mesh seem to stand elsewhere, {listed(parts)} among them"
+        f"{since}: were they moved, was what carries the LiDAR pushed, or is its place at some "
+        "stops wrong?"
     )
     return _otherwise("surface", "many parts", MESH, whole(said))
+
+
+def of_scan(scan: Group, said: str) -> dict[str, Any]:
+    """A scan of which a clause says what is wrong with it as a whole, in the same form."""
+    found = _otherwise("scan", scan.what, scan.where, whole(said))
+    recording = scan.recording or None
+    return {**found, "stop": scan.where, "recording": recording, "without": scan.token}
 
 
 def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:

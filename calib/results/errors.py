@@ -209,14 +209,15 @@ class Foretold:
     """How well it is known where a stop stands that was predicted, and not fitted to its scan.
 
     Args:
-        planes: name of the unknown of planes found in the scans, P numbers; "" with a mesh.
-        covariance: (6 + P, 6 + P) of the LiDAR's right increment, and of the planes: where neither
-            tracker nor mesh is there, all may be shifted together, and no beam reads otherwise.
+        beside: in a room of planes that were found in the scans, the unknowns that its beams depend
+            on, P numbers: the planes and the effects. Where neither tracker nor mesh is there, all
+            may be shifted together, or be longer together, and no beam reads otherwise.
+        covariance: (6 + P, 6 + P) of the LiDAR's right increment, and of these.
         chance: unknown -> (n,) variances of what chance does anew to each stop or location, which
             no other tells.
     """
 
-    planes: str
+    beside: Mapping[str, slice]
     covariance: np.ndarray
     chance: Mapping[str, np.ndarray]
 
@@ -225,17 +226,18 @@ class Foretold:
         """By an estimate's marginals."""
         placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, predicted.values)
         names, known = list(placed.d), predicted.problem.variables
-        found = isinstance(scan.meeting, PlaneSurface) and scan.meeting.variable
-        planes = found if found and found in known else ""
-        d = np.hstack([placed.d[name][0] for name in names])
-        if planes:
-            d = block_diag(d, np.eye(known[planes].dim))
-            names.append(planes)
-        acting = (t.variable for t in scan.terms if t.variable in known)
+        acting = [t.variable for t in scan.terms if t.variable in known]
         drawn = [name for name in acting if known[name].role is Role.SCATTER]
+        beside, end = {}, TWIST
+        if isinstance(scan.meeting, PlaneSurface):
+            for name in dict.fromkeys([scan.meeting.variable, *acting]):
+                if name in known and name not in (*drawn, *names):
+                    beside[name] = slice(end, end := end + known[name].dim)
+        d = np.hstack([placed.d[name][0] for name in names])
+        d = block_diag(d, np.eye(end - TWIST))
         return cls(
-            planes=planes,
-            covariance=d @ predicted.covariance_of(names) @ d.T,
+            beside=beside,
+            covariance=d @ predicted.covariance_of([*names, *beside]) @ d.T,
             chance={name: np.diag(predicted.covariance_of([name])) for name in drawn},
         )
 
@@ -243,9 +245,13 @@ class Foretold:
         """What that adds (N,) to what is expected of the residuals."""
         moves = np.zeros((len(rows.by_twist), len(self.covariance)))
         moves[:, :TWIST] = rows.by_twist
-        for column in (c for c in rows.sparse if c.variable == self.planes):
+        for name, at in self.beside.items():
+            if name in rows.dense:
+                moves[:, at] = rows.dense[name]
+        for column in (c for c in rows.sparse if c.variable in self.beside):
             met = np.flatnonzero(column.index >= 0)
-            moves[met, TWIST + column.components[column.index[met]]] = column.value[met]
+            at = self.beside[column.variable].start + column.components[column.index[met]]
+            moves[met, at] = column.value[met]
         out = np.einsum("ni,ni->n", moves @ self.covariance, moves)
         for column in rows.sparse:
             if column.variable in self.chance:

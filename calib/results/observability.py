@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from calib.problem.unknowns import Unknown
+from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
@@ -27,13 +28,14 @@ def odd(estimate: Estimate) -> list[str]:
     """Which numbers and scans of the recordings are hardly what they are taken for; clauses."""
     sources = [(s.rig, s.recording) for s in estimate.problem.sources]
     numbers = [each for rig, stops in sources for each in (*odd_rig(rig), *odd_numbers(rig, stops))]
-    return [*numbers, *seen_alone(estimate)]
+    alone = seen_alone(estimate)
+    return [*numbers, *([shown_by_no_other(alone)] if alone else [])]
 
 
-def seen_alone(estimate: Estimate) -> list[str]:
+def seen_alone(estimate: Estimate) -> list[Group]:
     """Scans that see planes of their own, where planes are what was found in the scans: such a scan
-    tells nothing, and one that belongs to another stop is such a scan. A clause, if there are."""
-    found: list[str] = []
+    tells nothing, and one that belongs to another stop is such a scan."""
+    found: list[Group] = []
     rooms: dict[int, list[int]] = {}
     for i, scan in enumerate(estimate.scans):
         if isinstance(scan.meeting, PlaneSurface):
@@ -46,13 +48,16 @@ def seen_alone(estimate: Estimate) -> list[str]:
         others = np.sort(share, axis=0)[-2] if len(share) > 1 else np.ones(share.shape[1])
         own = np.where((share > SEEN_SHARE) & (others < HARDLY_SEEN), share, 0.0)
         alone = own.sum(axis=1) > ALONE_SHARE
-        found += [estimate.scans[i].name for i, mine in zip(some, alone, strict=True) if mine]
-    if not found:
-        return []
-    return [
-        f"most of what the scan of stop {listed(found)} shows, no other scan does: it tells "
-        "nothing of the rig; does it belong to another stop?"
-    ]
+        found += [estimate.scans[i].group for i, mine in zip(some, alone, strict=True) if mine]
+    return found
+
+
+def shown_by_no_other(scans: Sequence[Group]) -> str:
+    """What is said of such scans; a clause."""
+    return (
+        f"most of what the scan of stop {listed([scan.where for scan in scans])} shows, no other "
+        "scan does: it tells nothing of the rig; does it belong to another stop?"
+    )
 
 
 def not_estimated(

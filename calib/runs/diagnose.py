@@ -36,6 +36,7 @@ from calib.recalibration.links import moved_since_cad
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
+from calib.results.observability import seen_alone, shown_by_no_other
 from calib.results.outstanding import moves
 from calib.results.rings import harmful, odd_rings
 from calib.results.sigmas import TOLERATED
@@ -103,6 +104,7 @@ def _found(
         [
             *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
             *_not_as_drawn(run, found),
+            *(told.of_scan(s, shown_by_no_other([s])) for s in seen_alone(stand.estimate)),
             *between,
         ],
         formulas,
@@ -237,8 +239,8 @@ def _not_as_drawn(run: Run, found: Search) -> Iterator[dict[str, Any]]:
     """Angles of the arm that are far from where they are drawn, of a fit that has come to its end;
     not those that were found to be blunders."""
     named = {left.blunder.group.what for left in found.blunders}
-    moved = moves(run.summary) if run.converged else {}
-    yield from (each for each in told.not_as_drawn(moved) if each["name"] not in named)
+    drawn = told.not_as_drawn(moves(run.summary) if run.converged else {})
+    yield from (each for each in drawn if each["name"] not in named)
 
 
 def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
@@ -328,9 +330,8 @@ def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:
 
 def _planned_for(stand: Stand) -> bool:
     """Whether stops can be planned: the rig has an arm and, of scans, a mesh."""
-    source = stand.sources[0]
-    meets = source.reference is not None or not stand.problem.scans
-    return bool(source.rig.joint_names) and meets
+    first, scans = stand.sources[0], stand.problem.scans
+    return bool(first.rig.joint_names and (first.reference or not scans))
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:
@@ -355,17 +356,16 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
 
 def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
     """From which rms of elevations other numbers of rings are told, of all LiDARs."""
-    lidars = [s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any()]
+    lidars = (s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any())
     sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
     return {"rings": {"rad": max(sizes)}} if sizes else {}
 
 
 def _scale_detectable(found: Diagnosis) -> dict[str, dict[str, float]]:
-    """From which size a wrong scale of the mesh is found, where the model does not have it: as the
-    effect that it is."""
+    """From which size a wrong scale of the mesh is found, where the model does not have it."""
     sizes = {c["effect"]: c["smallest_detectable"] for c in found.candidates}
-    size = sizes.get(FaroScale.name)
-    return {f"{MESH}:scale": {FaroScale.unit: size}} if size and np.isfinite(size) else {}
+    known = np.isfinite(size := sizes.get(FaroScale.name) or np.nan)
+    return {f"{MESH}:scale": {FaroScale.unit: size}} if known else {}
 
 
 def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:

@@ -10,9 +10,11 @@ import pytest
 
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.results.observability import seen_alone
 from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.solve.fit import solve
 from calib.solve.loop import _beyond_doubt
 from chains import se3
@@ -125,8 +127,12 @@ def test_exchanged_scans_of_a_room_without_a_mesh_are_told(tmp_path):
     a.rename(folder / "scan.parquet")
     b.rename(a)
     (folder / "scan.parquet").rename(b)
-    (said,) = calibrate([folder], tmp_path / "run", hold_out="none").summary["odd"]
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    (said,) = run.summary["odd"]
     assert "L00P04, L00P09" in said and "another stop" in said
+    found = diagnose(run)
+    assert found.verdict == "bad_data" and found.blunders[0]["stop"] == "L00P04"
+    assert found.command.endswith("--without L00P04:scan --without L00P09:scan")
 
 
 @pytest.mark.parametrize(("moved_m", "tells"), [((0.02, 0, 0), False), ((0, 0.004, 0), True)])
@@ -156,10 +162,12 @@ def test_along_a_corridor_scans_need_not_look_again(moved_m, tells):
 def test_a_scan_is_alone_where_no_other_sees_what_it_does(beams, alone):
     room = PlaneSurface(planes=None, variable="planes")
     estimate = SimpleNamespace(
-        scans=[SimpleNamespace(name=f"s{k}", meeting=room) for k in range(len(beams))],
+        scans=[
+            SimpleNamespace(group=Group("scan", f"s{k}", "scan"), meeting=room)
+            for k in range(len(beams))
+        ],
         associations=[
             SimpleNamespace(part=np.repeat(np.arange(len(each)), each)) for each in beams
         ],
     )
-    said = "".join(seen_alone(estimate))
-    assert all(name in said for name in alone) and bool(said) == bool(alone)
+    assert [scan.where for scan in seen_alone(estimate)] == list(alone)

@@ -136,7 +136,9 @@ def test_of_several_recordings_nothing_says_what_came_first():
 
 
 def test_many_parts_that_moved_are_one_rig_that_did():
-    assert "4 parts" in of_many_parts(["region_1", "region_2", "region_3", "region_4"])["sentence"]
+    parts = ["region_1", "region_2", "region_3", "region_4"]
+    said = of_many_parts(parts, "from stop s2 on")["sentence"]
+    assert said.startswith("4 parts") and "region_1 from stop s2 on: were" in said
     twice = [{"without": "mesh:surface_1"}, {"without": "mesh:surface_1"}, {"without": None}]
     assert tokens(twice) == ["mesh:surface_1"]
 

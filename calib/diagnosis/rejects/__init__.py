@@ -62,11 +62,11 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     counts = count(stand, progress)
     enough = len(counts.stop_names) >= FEWEST_STOPS
     every, least = _places(counts) if enough else ([], 1.0)
-    structured = _any(counts, [inside for inside, place in every if place.structured])
-    parts = [*moved(counts, ~structured)] if enough else []
+    known = [inside for inside, place in every if place.structured and not place.of_mesh]
+    parts = moved(counts, ~_any(counts, known)) if enough else []
     elsewhere = _any(counts, [some for _, some in parts])
     every = [(mine, place) for mine, place in every if elsewhere[mine].mean() <= MOSTLY_ELSEWHERE]
-    in_the_way = _any(counts, [mine for mine, place in every if place.in_the_way])
+    said = [mine for mine, place in every if place.structured or place.in_the_way]
     places = [place for _, place in every]
     total = int(counts.met.sum())
     rest = counts.rejected[~_any(counts, [mine for mine, _ in every]) & ~elsewhere]
@@ -75,7 +75,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     apart = [place for place in places if place.structured]
     outside = 1.0 - sum(place.beams for place in apart)
     usual = float((~elsewhere).sum()) / total - sum(place.rejected for place in apart)
-    others = counts.rejected[~(structured | elsewhere | in_the_way)]
+    others = counts.rejected[~_any(counts, said) & ~elsewhere]
     beyond = len(others) / total - hit > CLUTTER
     return Rejects(
         share=len(counts.rejected) / total,

@@ -16,9 +16,9 @@ import numpy as np
 
 from calib.blunders import told
 from calib.blunders.chance import LEAST_P
-from calib.diagnosis.rejects.counts import Counts, Rejected
+from calib.diagnosis.rejects.counts import AGREES, Counts, Rejected
 from calib.problem.model import Source
-from calib.residuals.groups import REGION_PART, SURFACE, part_of_mesh
+from calib.residuals.groups import ALONG_NORMAL, REGION_PART, SURFACE, part_of_mesh
 from calib.rig.suspect import listed
 
 # Share of a part's beams at a stop that end elsewhere, from which the part itself does. A box on
@@ -50,11 +50,15 @@ class MovedPart:
     along: str
     rejected: float
 
+    @property
+    def when(self) -> str:
+        """In words; empty if at all stops."""
+        at = f"at stop {listed(self.stops, MOST_STOPS_SAID)}" if self.stops else ""
+        return f"from stop {self.stops[0]} on" if self.since else at
+
     def blunder(self, sources: Sequence[Source]) -> dict[str, Any]:
         """As a blunder in diagnosis.json."""
-        at = f"at stop {listed(self.stops, MOST_STOPS_SAID)}" if self.stops else ""
-        when = f"from stop {self.stops[0]} on" if self.since else at
-        off = told.Elsewhere(self.away_m, self.sigma_m, self.along, when)
+        off = told.Elsewhere(self.away_m, self.sigma_m, self.along, self.when)
         return told.of_part(self.part, sources, off, LEAST_P)
 
     def document(self) -> dict[str, Any]:
@@ -69,47 +73,78 @@ class MovedPart:
         }
 
 
-def moved(counts: Counts, left: np.ndarray) -> Iterator[tuple[MovedPart, np.ndarray]]:
-    """Parts of the mesh that stand elsewhere, and which of the rejected (R,) that explains.
+def moved(counts: Counts, left: np.ndarray) -> list[tuple[MovedPart, np.ndarray]]:
+    """Parts of the mesh that stand elsewhere, and which of the rejected (R,) that explains. Regions
+    of a surface that moved as it did belong to it.
 
     Args:
         counts: the beams.
         left: (R,) the rejected that nothing explains yet.
     """
     if not counts.place_names:  # planes found in the scans are where these have them
-        return
+        return []
+    found: list[_Found] = []
     rejected, left = counts.rejected, left.copy()
     kinds = (
-        (SURFACE, rejected.surface, counts.met, counts.surface_names),
-        (REGION_PART, rejected.place, counts.met_places, counts.place_names),
+        (SURFACE, rejected.surface, counts.met),
+        (REGION_PART, rejected.place, counts.met_places),
     )
-    for kind, part, met, names in kinds:
+    for kind, part, met in kinds:
         ends = np.zeros(met.shape, int)  # how many of its beams end elsewhere
         np.add.at(ends, (rejected.stop[left], part[left]), 1)
         whole = (met >= FEWEST_MET) & (ends > WHOLE_SHARE * met)
-        for p in np.flatnonzero(np.count_nonzero(whole, axis=0) >= FEWEST_MOVED):
+        for p in np.flatnonzero(whole.any(axis=0)):
             mine = left & (part == p) & whole[rejected.stop, p]
             for some, along in _agreeing(rejected, mine):
-                stops = np.unique(rejected.stop[some])
-                if len(stops) < FEWEST_MOVED:
-                    continue
-                others = np.setdiff1d(np.flatnonzero(met[:, p] >= FEWEST_MET), stops)
-                stops = stops[np.argsort(counts.rank[stops], kind="stable")]
-                since = np.min(counts.rank[stops]) > np.max(counts.rank[others], initial=-1.0)
-                here = rejected[some].along(along)
+                here = _Found(kind, int(p), along, some)
+                if not any(each.takes(here, rejected) for each in found):
+                    found.append(here)
                 left &= ~some
-                yield (
-                    MovedPart(
-                        part=part_of_mesh(kind, names[p]),
-                        stops=tuple(counts.stop_names[i] for i in stops) if len(others) else (),
-                        since=bool(len(others) and since),
-                        away_m=float(np.median(here.residual_m)),
-                        sigma_m=here.sigma_m,
-                        along=along,
-                        rejected=float(some.sum() / counts.met.sum()),
-                    ),
-                    some,
-                )
+    found = [each for each in found if len(np.unique(rejected.stop[each.some])) >= FEWEST_MOVED]
+    return [(each.told(counts), each.some) for each in found]
+
+
+@dataclass
+class _Found:
+    """Rejected beams (R,) `some` of the part `number` of a kind that agree on another place."""
+
+    kind: str
+    number: int
+    along: str
+    some: np.ndarray
+
+    def takes(self, other: _Found, rejected: Rejected) -> bool:
+        """Take in what is of a region of this surface that stands where it does; whether it is."""
+        if self.kind != SURFACE or other.kind == SURFACE:
+            return False
+        here, there = rejected[self.some], rejected[other.some]
+        away_m = np.median(here.along(ALONG_NORMAL).residual_m)
+        off_m = np.abs(there.along(ALONG_NORMAL).residual_m - away_m)
+        mine = (there.surface == self.number) & (off_m < there.along(ALONG_NORMAL).reach_m)
+        if mine.mean() <= AGREES:
+            return False
+        self.some = self.some | other.some
+        return True
+
+    def told(self, counts: Counts) -> MovedPart:
+        """As people are told."""
+        surface = self.kind == SURFACE
+        met = (counts.met if surface else counts.met_places)[:, self.number]
+        names = counts.surface_names if surface else counts.place_names
+        stops = np.unique(counts.rejected.stop[self.some])
+        others = np.setdiff1d(np.flatnonzero(met >= FEWEST_MET), stops)
+        stops = stops[np.argsort(counts.rank[stops], kind="stable")]
+        since = np.min(counts.rank[stops]) > np.max(counts.rank[others], initial=-1.0)
+        here = counts.rejected[self.some].along(self.along)
+        return MovedPart(
+            part=part_of_mesh(self.kind, names[self.number]),
+            stops=tuple(counts.stop_names[i] for i in stops) if len(others) else (),
+            since=bool(len(others) and since),
+            away_m=float(np.median(here.residual_m)),
+            sigma_m=here.sigma_m,
+            along=self.along,
+            rejected=float(self.some.sum() / counts.met.sum()),
+        )
 
 
 def _agreeing(rejected: Rejected, mine: np.ndarray) -> Iterator[tuple[np.ndarray, str]]:

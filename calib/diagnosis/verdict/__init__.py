@@ -170,7 +170,7 @@ def conclude(
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
-    over = _over_the_expected(found, held_out, judged_mm(summary))
+    over = _over_the_expected(found, held_out, summary)
     unsure, doubt = (False, None) if blunders or more else _unconfirmed(found, over)
     calm = BAD if forbids else UNNAMED if unsure else "adequate"
     answer = hold and not formulas.needless
@@ -254,12 +254,16 @@ def _disbelief(forbids: Sequence[str]) -> str:
 
 
 def _over_the_expected(
-    found: Search, held_out: Mapping[str, Fall], rms_mm: Mapping[str, float | None]
+    found: Search, held_out: Mapping[str, Fall], summary: Mapping[str, Any]
 ) -> float:
     """The held-out error over the expected one, of the model with what scatters by chance; 0 where
-    nothing was held out."""
+    nothing was held out, or too few stops to tell."""
+    each = summary.get("held_out_each_mm")  # which earlier versions lack
+    if each is not None and len(each) < FEWEST_STOPS:
+        return 0.0
     if fall := beside_scatter(found, held_out):
         return fall.after_mm / fall.floor_mm
+    rms_mm = judged_mm(summary)
     error, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
     unknown = error is None or not floor or found.chance
     return 0.0 if unknown else error / floor
