@@ -26,6 +26,7 @@ from calib.rig.suspect import listed
 # all of a region, at all distances.
 WHOLE_SHARE = 0.9
 FEWEST_MET = 20  # of a part at a stop: with fewer, mixed pixels at edges are all there is
+NO_PART = "-1"  # as beams that meet no part are counted
 MOST_STOPS_SAID = 6  # in a sentence
 FEWEST_MOVED = 2  # stops: at one alone, something flat may stand in front
 
@@ -86,13 +87,14 @@ def moved(counts: Counts, left: np.ndarray) -> list[tuple[MovedPart, np.ndarray]
     found: list[_Found] = []
     rejected, left = counts.rejected, left.copy()
     kinds = (
-        (SURFACE, rejected.surface, counts.met),
-        (REGION_PART, rejected.place, counts.met_places),
+        (SURFACE, rejected.surface, counts.met, counts.surface_names),
+        (REGION_PART, rejected.place, counts.met_places, counts.place_names),
     )
-    for kind, part, met in kinds:
+    for kind, part, met, names in kinds:
         ends = np.zeros(met.shape, int)  # how many of its beams end elsewhere
         np.add.at(ends, (rejected.stop[left], part[left]), 1)
         whole = (met >= FEWEST_MET) & (ends > WHOLE_SHARE * met)
+        whole &= [name != NO_PART for name in names]
         for p in np.flatnonzero(whole.any(axis=0)):
             mine = left & (part == p) & whole[rejected.stop, p]
             for some, along in _agreeing(rejected, mine):
