@@ -179,11 +179,13 @@ def test_scatter_does_not_excuse_what_it_does_not_explain(look, times, doubted):
     """The error that counts is that of the model with what scatters; without, nobody knows."""
     chance = [SimpleNamespace(effect=SimpleNamespace(name="stop_range_scatter"))]
     found = Search([look], found=(), blunders=(), unnamed=(), scatter=None, chance=chance)
-    rms_mm = {"held_out": 9.0, "fit": 2.0, "noise_floor": 2.0}
-    assert _over_the_expected(found, {}, rms_mm) == 0.0
+    summary = {"rms_mm": {"held_out": 9.0, "fit": 2.0, "noise_floor": 2.0}}
+    assert _over_the_expected(found, {}, summary) == 0.0
     falls = {"stop_range_scatter": Fall(9.0, times * 3.0, 3.0)}
-    over = _over_the_expected(found, falls, rms_mm)
+    over = _over_the_expected(found, falls, summary)
     assert over == pytest.approx(times)
+    few = summary | {"held_out_each_mm": [8.0, 9.0, 10.0]}
+    assert _over_the_expected(found, falls, few) == 0.0, "three stops judge no model"
     assert _unconfirmed(found, over)[0] == doubted
 
 
