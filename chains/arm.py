@@ -140,18 +140,14 @@ def gravity_torque(
         chain = _serial(tree, end)
         ours = [tree.joint_names.index(name) for name in chain.joint_names]
         edges = [len(tree.path(mass.frame)) for mass in mine]
-        centres = np.array([mass.centre_m for mass in mine])
-        axes, at_m = chain.axes_and_points(joints[:, ours], edges, centres)
+        axes, at_m = chain.axes_and_points(
+            joints[:, ours], edges, np.array([mass.centre_m for mass in mine])
+        )
+        before = np.array([chain.behind[edge][0] for edge in edges])
+        beyond = (before > np.arange(len(chain.turns))[:, None]).astype(float)
         # Of all that lies beyond each axis: how much, and the sum of where, weighed by that.
-        whole, first = (np.zeros((len(chain.turns) + 1, n, len(joints))) for n in (1, 3))
-        for mass, edge, where_m in zip(mine, edges, at_m, strict=True):
-            last = chain.behind[edge][0]
-            whole[last] += mass.kg
-            first[last] += mass.kg * where_m
-        for axis in range(len(chain.turns) - 1, 0, -1):
-            whole[axis] += whole[axis + 1]
-            first[axis] += first[axis + 1]
-        whole, first = whole[1:], first[1:]
+        kg = np.stack([np.broadcast_to(mass.kg, len(joints)) for mass in mine])[:, None]
+        whole, first = (np.tensordot(beyond, of, axes=1) for of in (kg, kg * at_m))
         across = cross(axes.direction, first - whole * axes.at_m)
         along = np.where(chain.turns[:, None, None], across, whole * axes.direction)
         torque[:, ours] -= G * (chain.by @ (along * np.atleast_2d(up).T).sum(axis=1)).T

@@ -6,8 +6,7 @@ derivative by every edge costs there.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,11 +30,6 @@ class Axes:
     T: Array
     turns: Array
     by: Array
-
-    def __getitem__(self, some: Array) -> Self:
-        """Return these at some of the poses."""
-        direction, at_m = self.direction[..., some], self.at_m[..., some]
-        return replace(self, direction=direction, at_m=at_m, T=self.T[some])
 
     def jacobian(self) -> Array:
         """Return the end's motion (K, 6, J), rotation over translation, in the start's axes."""

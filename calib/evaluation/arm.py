@@ -22,7 +22,7 @@ from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
 from chains import se3
 from chains.errors import InputError
-from chains.serial import CHUNK, Axes, SerialChain
+from chains.serial import CHUNK, SerialChain
 
 Columns = Mapping[str, np.ndarray]
 # Steps of the inverse, where the arm is not stretched and where it is.
@@ -163,7 +163,8 @@ class Arm:
 
         for first in range(0, len(near), CHUNK):
             solve(np.arange(first, min(first + CHUNK, len(near))), near, USUAL_STEPS)
-        solve(np.flatnonzero(self._far(off)), command, STRETCHED_STEPS)
+        far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
+        solve(np.flatnonzero(far), command, STRETCHED_STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
         return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
 
@@ -172,28 +173,23 @@ class Arm:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Commands (K, J) after some steps, and what is then left, (K, 6) of `_off`."""
         command, damped = near.copy(), np.ones(len(near))
-        off, axes = self._off(wanted, command, columns)
-        J = self._jacobian(axes)
-        moving = np.flatnonzero(self._far(off))
+        off, J = self._off(wanted, command, columns)
+        moving = np.arange(len(near))
         for _ in range(steps):
+            far = np.abs(off[moving]).max(axis=1, initial=0.0) > REACHED * self._length_m
+            moving = moving[far & (damped[moving] < GIVEN_UP)]
             if not len(moving):
                 break
             tried = command[moving]
             tried[:, self._ours] += self._step(J[moving], off[moving], damped[moving])
             here = {name: column[moving] for name, column in columns.items()}
-            then, axes = self._off(wanted[moving], tried, here)
+            then, J_then = self._off(wanted[moving], tried, here)
             nearer = np.linalg.norm(then, axis=1) < np.linalg.norm(off[moving], axis=1)
             times = damped[moving] * np.where(nearer, 0.1, 10.0)
             damped[moving] = np.maximum(times, LEAST_DAMPED)
-            better, far = moving[nearer], self._far(then)
-            command[better], off[better] = tried[nearer], then[nearer]
-            J[moving[nearer & far]] = self._jacobian(axes[nearer & far])
-            moving = moving[np.where(nearer, far, damped[moving] < GIVEN_UP)]
+            better = moving[nearer]
+            command[better], off[better], J[better] = tried[nearer], then[nearer], J_then[nearer]
         return command, off
-
-    def _far(self, off: np.ndarray) -> np.ndarray:
-        """Whether tips that are so far off (K, 6) have not been reached."""
-        return np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
 
     def _step(self, J: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
         """How far to turn joints between base and tip (K, n) for tips that are so far off (K, 6),
@@ -206,20 +202,16 @@ class Arm:
 
     def _off(
         self, wanted: np.ndarray, joints: np.ndarray, columns: Columns
-    ) -> tuple[np.ndarray, Axes]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """How far (K, 6) tips are from where they are wanted, in the base's axes: rotation times
-        the arm's length, and m; and the axes there, but for what effects change of them."""
+        the arm's length, and m; and how they move by the joints between base and tip (K, 6, n),
+        but for what effects change of that."""
         true, twists = self._bent(joints, columns)
         axes = self._fixed.axes(true[:, self._ours])
-        T = axes.T if twists is None else self._through(true, twists)
-        turn = se3.so3_log(wanted[:, :3, :3] @ T[:, :3, :3].mT)
-        return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]]), axes
-
-    def _jacobian(self, axes: Axes) -> np.ndarray:
-        """How tips move (K, 6, n), in the units of `_off`, by the joints between base and tip."""
-        J = axes.jacobian()
+        T, J = axes.T if twists is None else self._through(true, twists), axes.jacobian()
         J[:, :3] *= self._length_m
-        return J
+        turn = se3.so3_log(wanted[:, :3, :3] @ T[:, :3, :3].mT)
+        return np.hstack([self._length_m * turn, wanted[:, :3, 3] - T[:, :3, 3]]), J
 
     def _placed(self, joints: np.ndarray, columns: Columns) -> np.ndarray:
         true, twists = self._bent(joints, columns)

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.problem.model import Source
 from calib.rig.scanned import ScanSums, numbering
-from sensors.rings import REVERSED, RingFinding
+from sensors.rings import REVERSED, RingFinding, least_off_rad
 
 LOOKED = 3  # scans of a recording from which the numbers are checked: each holds all rings
 
@@ -33,6 +33,13 @@ def harmful(what: str) -> bool:
     """Whether offsets by ring are of no use; where rings are counted from the other end, as many
     drivers do, they are right, and only a table by the LiDAR's own channels has another order."""
     return what != REVERSED
+
+
+def detectable(sources: Iterable[Source]) -> dict[str, dict[str, float]]:
+    """From which rms of elevations other numbers of rings are told, of all LiDARs."""
+    lidars = [s.rig.lidar for s in sources if s.rig.lidar and s.recording.has_scan.any()]
+    sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
+    return {"rings": {"rad": max(sizes)}} if sizes else {}
 
 
 def documents(sources: Iterable[Source]) -> list[dict[str, Any]]:

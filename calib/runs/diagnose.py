@@ -38,7 +38,7 @@ from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_pose
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.observability import seen_alone, shown_by_no_other
 from calib.results.outstanding import moves
-from calib.results.rings import harmful, odd_rings
+from calib.results.rings import detectable, harmful, odd_rings
 from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -47,7 +47,6 @@ from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from sensors.documents import write_json
-from sensors.rings import least_off_rad
 
 
 @one_blas_thread
@@ -117,7 +116,7 @@ def _found(
         plan=command_to_plan(run, apart) if apart and _planned_for(stand) else "",
         remedies=list(remedies(run, result, _planned_for(stand))),
         scatter=[*_scatter(run, stand), *result.scatter],
-        detectable={**_detectable(stand), **_scale_detectable(result)},
+        detectable={**detectable(stand.sources), **_scale_detectable(result)},
         unseen=unseen,
         sentences=[
             *run.doubts,
@@ -330,8 +329,9 @@ def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:
 
 def _planned_for(stand: Stand) -> bool:
     """Whether stops can be planned: the rig has an arm and, of scans, a mesh."""
-    first, scans = stand.sources[0], stand.problem.scans
-    return bool(first.rig.joint_names and (first.reference or not scans))
+    source = stand.sources[0]
+    meets = source.reference is not None or not stand.problem.scans
+    return bool(source.rig.joint_names) and meets
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:
@@ -354,18 +354,12 @@ def command_without(run: Run, tokens: Sequence[str]) -> str:
     return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
-def _detectable(stand: Stand) -> dict[str, dict[str, float]]:
-    """From which rms of elevations other numbers of rings are told, of all LiDARs."""
-    lidars = (s.rig.lidar for s in stand.sources if s.rig.lidar and s.recording.has_scan.any())
-    sizes = [size for size in map(least_off_rad, lidars) if np.isfinite(size)]
-    return {"rings": {"rad": max(sizes)}} if sizes else {}
-
-
 def _scale_detectable(found: Diagnosis) -> dict[str, dict[str, float]]:
-    """From which size a wrong scale of the mesh is found, where the model does not have it."""
+    """From which size a wrong scale of the mesh is found, where the model does not have it: as the
+    effect that it is."""
     sizes = {c["effect"]: c["smallest_detectable"] for c in found.candidates}
-    known = np.isfinite(size := sizes.get(FaroScale.name) or np.nan)
-    return {f"{MESH}:scale": {FaroScale.unit: size}} if known else {}
+    size = sizes.get(FaroScale.name)
+    return {f"{MESH}:scale": {FaroScale.unit: size}} if size and np.isfinite(size) else {}
 
 
 def _reaches(look: Look, run: Run) -> dict[Group, FurthestMoved]:

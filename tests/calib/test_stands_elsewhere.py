@@ -67,13 +67,13 @@ def counted(away_m, time_s, recordings=1, reach_m=0.02):
     beams of all incidences; NaN where it stands where it was, and nothing is rejected."""
     away_m, beams = np.asarray(away_m), 50
     stops = np.flatnonzero(np.isfinite(away_m))
-    slant = np.linspace(0.4, 1.0, beams)
+    slant, names = np.linspace(0.4, 1.0, beams), [f"s{k}" for k in range(len(away_m))]
     recording = [
-        SimpleNamespace(time_s=np.asarray(time_s, float), stops=list(range(len(away_m))))
-        for _ in range(recordings)
+        SimpleNamespace(time_s=np.asarray(time_s, float), stops=names) for _ in range(recordings)
     ]
     scans = [
-        SimpleNamespace(recording=recording[k % recordings], index=k) for k in range(len(away_m))
+        SimpleNamespace(recording=recording[k % recordings], name=name)
+        for k, name in enumerate(names)
     ]
     met = np.full((len(away_m), 1), beams)
     none = np.zeros(beams * len(stops), int)
@@ -85,7 +85,7 @@ def counted(away_m, time_s, recordings=1, reach_m=0.02):
         met=met,
         met_places=met,
         rank=rank(scans),
-        stop_names=[f"s{k}" for k in range(len(away_m))],
+        stop_names=names,
         surface_names=["3"],
         place_names=["7"],
         rejected=Rejected(

@@ -18,6 +18,7 @@ from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL
 from calib.residuals.robust import TUKEY
 from calib.residuals.scan import ScanStop
 from calib.solve.fit import Progress
+from sensors.stops import in_time
 
 CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and what is tested
 # Share of rejected beams that agree on a size, beyond those that agree with its negative, from
@@ -269,9 +270,8 @@ def _rank(scans: Sequence[ScanStop]) -> np.ndarray:
     first = scans[0].recording
     if any(scan.recording is not first for scan in scans):
         return np.full(len(scans), np.nan)
-    at = np.array([scan.index for scan in scans])
-    when = first.time_s if np.isfinite(first.time_s).all() else np.arange(len(first.stops))
-    return np.argsort(np.argsort(when[at], kind="stable"), kind="stable").astype(float)
+    when = {stop: k for k, stop in enumerate(in_time(first.stops, first.time_s))}
+    return np.array([when[scan.name] for scan in scans], float)
 
 
 def meshed(stand: Stand) -> bool:

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 
 from calib.blunders import told
-from calib.diagnosis.rejects.moved import MovedPart
+from calib.diagnosis.rejects.moved import MOST_NAMED, MovedPart
 from calib.diagnosis.suggest import words
 from calib.problem.model import Source
 from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL, MESH_PARTS, part_of_mesh
 from calib.rig.suspect import listed
 
-MOST_NAMED = 6  # stops or surfaces that a sentence names
 # Parts of the mesh, where more of which seem to have moved the rig may have: choices. Of two
-# cupboards five sides were seen; where rigs that should stand still were pushed by 30 and by 50 mm
-# it were 18 parts and four walls.
+# cupboards five sides were seen; where rigs that should stand still were pushed by 30 mm and by
+# 50 mm, 18 parts and four walls seemed to have moved.
 MOST_MOVED, MOST_BESIDE_A_STAND = 6, 3
 # Share of beams that makes a place structured, whatever their residuals do: a choice, ten times
 # what mixed pixels reach.

@@ -27,7 +27,7 @@ from calib.rig.suspect import listed
 WHOLE_SHARE = 0.9
 FEWEST_MET = 20  # of a part at a stop: with fewer, mixed pixels at edges are all there is
 NO_PART = "-1"  # as beams that meet no part are counted
-MOST_STOPS_SAID = 6  # in a sentence
+MOST_NAMED = 6  # stops or parts that a sentence names
 FEWEST_MOVED = 2  # stops: at one alone, something flat may stand in front
 
 
@@ -54,7 +54,7 @@ class MovedPart:
     @property
     def when(self) -> str:
         """In words; empty if at all stops."""
-        at = f"at stop {listed(self.stops, MOST_STOPS_SAID)}" if self.stops else ""
+        at = f"at stop {listed(self.stops, MOST_NAMED)}" if self.stops else ""
         return f"from stop {self.stops[0]} on" if self.since else at
 
     def blunder(self, sources: Sequence[Source]) -> dict[str, Any]:

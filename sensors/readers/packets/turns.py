@@ -69,13 +69,13 @@ def packet_sweeps(
             yield Sweep(float(middle_s[s]), decoder.points(window, mine))
 
     middle_s = (time_s[first] + time_s[last]) / 2
-    return Sweeps(name, clock, middle_s, read, lost=_lost(time_s, turns))
+    return Sweeps(name, clock, middle_s, read, lost=_lost(time_s, turns, first, last))
 
 
-def _lost(time_s: Array, turns: _Turns) -> float:
-    """Share of packets that are missing from turns, as those that are whole have as many as others
-    about them; not of turns that a pause, or an end, has cut."""
-    first, last = turns.extent()
+def _lost(time_s: Array, turns: _Turns, first: NDArray[np.int64], last: NDArray[np.int64]) -> float:
+    """Share of packets that are missing from turns, of which the first and last packet (S,) are
+    given: those that are whole have as many as others about them. Not of turns that a pause, or an
+    end, has cut."""
     pause = np.flatnonzero(np.diff(time_s) > _PAUSE_S)
     ends = np.concatenate([[0], pause, pause + 1, [len(time_s) - 1]])
     whole = np.ones(len(first), bool)
