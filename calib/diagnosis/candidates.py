@@ -18,7 +18,8 @@ def known_effects(
     columns: frozenset[str],
     catalogue: Sequence[Effect] = CATALOGUE,
 ) -> list[Effect]:
-    """The effects that the model lacks and the recordings can show, shape by shape.
+    """The effects that the model lacks and the recordings can show, shape by shape; of those that
+    repeat, also more of what it has.
 
     Args:
         model: as fitted.
@@ -27,17 +28,29 @@ def known_effects(
         catalogue: the effects that are known.
     """
     there = {effect.family for effect in model.effects}
-    found = []
+    found: list[Effect] = []
     for effect in catalogue:
-        if effect.family in there:
+        if effect.family in there and not effect.repeats:
             continue
         if effect.family in model.fixed or lacking(effect, sources, columns):
             continue
         if effect.shape_name:
-            found += [effect.at(shape) for shape in shapes_of(effect, sources)]
+            found += [effect.at(s) for s in _others(effect, shapes_of(effect, sources), model)]
         else:
             found.append(effect)
     return found
+
+
+def _others(effect: Effect, grid: Sequence[float], model: Model) -> list[float]:
+    """The shapes of a grid that a model has not. Next to a smooth one that it has, another only
+    says that this one is a little off; so of these, one of the grid lies between."""
+    shapes, number = np.array(grid), np.arange(len(grid))
+    there = np.zeros(len(grid), bool)
+    for mine in (e.shape for e in model.effects if e.family == effect.family):
+        there |= shapes == mine
+        if effect.has_derivative_by_shape:
+            there |= np.abs(number - np.interp(mine, shapes, number)) <= 1
+    return shapes[~there].tolist()
 
 
 def concerned(effect: Effect, sources: Sequence[Source]) -> bool:

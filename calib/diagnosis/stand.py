@@ -294,6 +294,7 @@ class Look:
         if not effect.shape_name:
             return self, candidate
         shaped = finer(effect, shapes_of(effect, stand.sources))
+        shaped = [each for each in shaped if each.name not in stand.model.names]
         linear, at, _ = stand.linearise(shaped, progress)
         scores = project(linear, linear.candidates, stand.spent)
         near = screen(scores, shaped, at, self.named.common)

@@ -138,6 +138,8 @@ class Effect(ABC):
         shape: the one chosen.
         whole: True where a shape is a whole number.
         jumps: True where the basis jumps with the shape, as at the time when something slipped.
+        repeats: True where a rig may have it several times, each with a shape of its own: what
+            slips once may slip again, and a gear may err in more than one order.
         finer: how many shapes are tried between the two of a grid beside the best one.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
@@ -167,6 +169,7 @@ class Effect(ABC):
     shape: float = 0.0
     whole: ClassVar[bool] = False
     jumps: ClassVar[bool] = False
+    repeats: ClassVar[bool] = False
     finer: ClassVar[int] = 9
     joint_kind: ClassVar[str] = ""
     needs_lidar: ClassVar[bool] = False

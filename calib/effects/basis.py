@@ -84,7 +84,7 @@ class Slips(Effect):
     """What happens once, at a time t_s since the first stop, and then stays."""
 
     shape_name, shape = "t_s", 900.0
-    jumps = True
+    jumps = repeats = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return step_times(stops) if self.params(stops.rig) else ()
@@ -101,7 +101,7 @@ class Creeps(Effect):
     """What happens little by little, evenly in time; per hour."""
 
     shape_name, shape = "", 0.0
-    jumps = False
+    jumps = repeats = False
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return ()
@@ -118,7 +118,7 @@ class Settles(Effect):
     """What happens fast at first, then ever more slowly, with a time constant tau_s."""
 
     shape_name, shape = "tau_s", 300.0
-    jumps = False
+    jumps = repeats = False
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Shares of the time measured in: after a longer one it would look like `Creeps`."""

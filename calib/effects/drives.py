@@ -70,6 +70,7 @@ class ArmGearError(ArmJointEccentricity):
     source = "harmonic drives: Mechanism and Machine Theory 2021, 104122"
     sigma = 0.0005
     shape_name, shape, whole = "ratio", 100.0, True
+    repeats = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Every low order, as of shafts and teeth, and ratios usual in arms, singly and doubled."""
@@ -90,6 +91,7 @@ class ArmScrewError(ArmJointEccentricity):
     source = "leads: ISO 3408-2; size assumed"
     sigma = 0.00005
     shape_name, shape = "lead", 0.01
+    repeats = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Usual leads in mm and inches, and teeth by their module; and longer, half a period after

@@ -95,6 +95,7 @@ class RangeCyclic(Effect):
     confounded_with = ("range_step", "near_range_bias", "range_quantisation")
     source = "Lichti and Licht 2006, ISPRS Archives XXXVI-5: additional parameters of scanners"
     shape_name, shape = "wavelength_m", 1.0
+    repeats = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """Even in 1 / L, from 0.3 to 4 m, so that over 5 m none lies between two unseen."""
@@ -138,7 +139,7 @@ class RangeStep(RangeEffect):
     confounded_with = ("range_cyclic", "near_range_bias", "range_scale")
     source = "near- and far-field firing: Hesai Pandar128E3X manual"
     shape_name, shape = "r_s_m", 2.75
-    jumps = True
+    jumps = repeats = True
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         return tuple(np.arange(1.0, 5.01, 0.25).tolist())

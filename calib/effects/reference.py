@@ -82,6 +82,7 @@ class MeshSeamX(MeshShift):
     confounded_with = ("mesh_shift", "moved_surface", "faro_scale")
     twin = ""
     shape_name, shape, jumps = "x_m", 0.0, True
+    repeats = True
     finer = FINER_SEAMS
     axis = 0  # across which seams run
 

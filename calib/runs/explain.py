@@ -225,10 +225,14 @@ class _Climb:
             effects = (read(described, self.run.folder / DIAGNOSIS, {}),)
         else:
             effects = load_effects((name,), own=() if is_known(name) else self._own)
-        families = {effect.family for effect in self._model.effects}
-        if name not in self.refused and effects[0].family not in families:
+        if name not in self.refused and not self._has(effects[0]):
             self._try(self._model.plus(effects), [name], [], instead)
-        return any(effect.family == effects[0].family for effect in self._model.effects)
+        return self._has(effects[0])
+
+    def _has(self, effect: Effect) -> bool:
+        """Whether the model has an effect; of one that repeats, in this very shape."""
+        key = "name" if effect.repeats else "family"
+        return any(getattr(mine, key) == getattr(effect, key) for mine in self._model.effects)
 
     def _leave_out(self, tokens: list[str]) -> None:
         """A rung with the same model, and less data: its errors say nothing against it."""

@@ -211,9 +211,17 @@ def test_what_was_dropped_comes_back_only_if_it_helps_and_it_ends(climbed):
 
 
 def test_a_shape_of_an_effect_that_is_there_is_not_added_beside_it(climbed):
-    cyclic = "range_cyclic@0.7"
-    world = World({of(): 9.0, of(cyclic): 5.0}, {of(): [cyclic], of(cyclic): ["range_cyclic@1.3"]})
-    assert ladder(climbed(world))[1:] == [([cyclic], [], 5.0)]
+    near = "near_range_bias@0.7"
+    world = World({of(): 9.0, of(near): 5.0}, {of(): [near], of(near): ["near_range_bias@1.3"]})
+    assert ladder(climbed(world))[1:] == [([near], [], 5.0)]
+
+
+def test_another_shape_of_what_repeats_is_added_beside_it(climbed):
+    one, two = "range_cyclic@0.7", "range_cyclic@1.3"
+    world = World(
+        {of(): 9.0, of(one): 5.0, of(one, two): 3.0, of(two): 6.0}, {of(): [one], of(one): [two]}
+    )
+    assert ladder(climbed(world))[1:] == [([one], [], 5.0), ([two], [], 3.0)]
 
 
 def test_it_ends_where_everything_helps(climbed):

@@ -158,7 +158,7 @@ def test_a_rig_that_is_pushed_has_moved_and_not_the_room(tmp_path, by_m, by_rad)
     """It stands still over six stops, as its description says, but for one push within them: ranges
     change by 2 and by 49 mm. Such rigs were told to have a joint that slipped, or a mesh in two
     parts."""
-    write(replace(STANDS, kicked=(9, by_m, by_rad)), tmp_path / "rec")
+    write(replace(STANDS, kicked=((9, by_m, by_rad),)), tmp_path / "rec")
     found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
     assert found.verdict == "missing_effect" and not found.blunders
     (name,) = found.worth_adding

@@ -36,8 +36,8 @@ class World:
         shifted: of rectangles that stand elsewhere than the mesh has them, from a stop on: their
             numbers, that of the stop, and by how much, m along the normal.
         stands: whether the base stays where it is while it is at a location.
-        kicked: the number of a stop from which on the base stands elsewhere, by how much, m, along
-            each axis, and how far it is turned, rad, about each.
+        kicked: numbers of stops from which on the base stands elsewhere, each with how far it went
+            then, m, along each axis, and how far it was turned, rad, about each.
         clutter: share of the beams that hit boxes which are not in the mesh, about.
         turned: share of its range that each joint goes through, about its middle; 0 never turns.
         then: stops that follow: the number of a location, and what the encoders are to say there.
@@ -63,7 +63,7 @@ class World:
     meshed: tuple[int, ...] = ()
     shifted: tuple[tuple[int, ...], int, float] = ((), 0, 0.0)
     stands: bool = False
-    kicked: tuple[int, float, float] = (0, 0.0, 0.0)
+    kicked: tuple[tuple[int, float, float], ...] = ()
     clutter: float = 0.0
     turned: tuple[float, ...] = (1.0,) * 6
     then: tuple[tuple[int, tuple[float, ...]], ...] = ()

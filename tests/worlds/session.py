@@ -78,8 +78,8 @@ def visited(world: World, rig: Hardware) -> Stops:
     T_base_mount, T_base_lidar = rig.of_base(true_rad)
     T_faro_base = _bases(world, rng)[location]
     settle = normal(6) * ([SETTLES_M] * 3 + [SETTLES_RAD] * 3) * (not world.stands)
-    kicked, by_m, by_rad = world.kicked
-    settle[kicked:] += [by_m] * 3 + [by_rad] * 3
+    for first, by_m, by_rad in world.kicked:
+        settle[first:] += [by_m] * 3 + [by_rad] * 3
     T_faro_base = moved(T_faro_base, settle[:, :3], settle[:, 3:])
     T_opti_base = inverse(rig.T_faro_opti) @ T_faro_base
     scatter = world.rng("scatter")

@@ -14,7 +14,6 @@ from calib.diagnosis.stand import Stand, tried
 from calib.effects import Effect, ShapeStep
 from calib.forward import named
 from calib.problem.build import shapes_of, stops_view, theta_of
-from calib.problem.model import Source
 from calib.solve.estimate import DOFS, SEEN
 from calib.solve.fit import Progress
 
@@ -73,7 +72,7 @@ def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> 
         theta = theta_of(stand.problem, effect, stand.estimate.values)
         if effect.has_derivative_by_shape:
             steps[effect.name] = [ShapeStep(effect, theta)]
-        elif effect.jumps and (others := _beside(effect, stand.sources)):
+        elif effect.jumps and (others := _beside(effect, stand)):
             steps[effect.name] = [ShapeStep(effect, theta, to=shape) for shape in others]
     if not steps:
         return {}
@@ -84,14 +83,16 @@ def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> 
         tests = ((step, score_test(scores, at[step.name])) for step in some)
         further = [_further(stand, step, test) for step, test in tests if test.dof]
         gain, shape = max(further, default=(0.0, effect.shape))
-        if gain > BETTER_SHAPE and shape != effect.shape:
-            swapped[name] = effect.at(shape)
+        better = effect.at(shape)
+        if gain > BETTER_SHAPE and better.name not in (name, *(e.name for e in swapped.values())):
+            swapped[name] = better
     return swapped
 
 
-def _beside(effect: Effect, sources: Collection[Source]) -> list[float]:
-    """Shapes to which an effect that jumps may go next."""
-    return sorted({shape for source in sources for shape in effect.beside(stops_view(source))})
+def _beside(effect: Effect, stand: Stand) -> list[float]:
+    """Shapes to which an effect that jumps may go next; where the model has it again, it stays."""
+    every = {shape for source in stand.sources for shape in effect.beside(stops_view(source))}
+    return sorted(shape for shape in every if effect.at(shape).name not in stand.model.names)
 
 
 def _further(stand: Stand, step: ShapeStep, test: ScoreTest) -> tuple[float, float]:

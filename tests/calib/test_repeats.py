@@ -1,0 +1,83 @@
+"""What a rig has twice, each with a shape of its own: slips at two times, two orders of a gear, two
+waves of the range. The second was told as scatter by chance, or as structure without a name."""
+
+import numpy as np
+import pytest
+
+from calib.diagnosis.candidates import known_effects
+from calib.problem.model import Model
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
+from calib.runs.explain import explain
+from calib.runs.reopen import model_of
+
+from . import arm_worlds
+from .simulated import made
+
+POSES = 120
+
+
+def arm_of(folder, seed):
+    """An arm in a folder, poses of it, and the generator that drew both."""
+    rng = np.random.default_rng(seed)
+    world = arm_worlds.bent(folder, "ur5e", rng, size=0.3)
+    return world, world.draw(rng, POSES), rng
+
+
+def test_a_tracker_that_slips_twice_is_named_at_both_times(tmp_path):
+    world, joints, rng = arm_of(tmp_path / "rec", 2)
+    time_s = np.cumsum(rng.uniform(8.0, 16.0, POSES))
+    first, again = 40, 85
+    by = np.zeros((POSES, 6))
+    by[first:, 3:] += [4e-4, 2e-4, 5e-4]
+    by[again:] += [0.0, 2e-4, 2e-4, 3e-4, -5e-4, 0.0]
+    seen = arm_worlds.exp(by) * world.seen(joints)
+    seen = seen * arm_worlds.exp(arm_worlds.noise(rng, POSES))
+    columns = {"elapsed_s": time_s - time_s[0]}
+    arm_worlds.save(tmp_path / "rec", world, joints, seen, columns)
+    grown = explain([tmp_path / "rec"], tmp_path / "out")
+    assert grown.diagnosis.verdict == "adequate"
+    slips = [e for e in model_of(grown.runs[-1]).effects if e.family == "tracker_slip"]
+    when = sorted(np.searchsorted(columns["elapsed_s"], e.shape) for e in slips)
+    assert when == [first, again]
+
+
+def test_a_gear_that_errs_in_two_orders_is_named_in_both(tmp_path):
+    world, joints, rng = arm_of(tmp_path / "rec", 1)
+    true = joints.copy()
+    true[:, 1] += 3e-4 * np.sin(100 * joints[:, 1] + 0.3)
+    true[:, 2] += 2e-4 * np.sin(50 * joints[:, 2] + 1.0)
+    noise = arm_worlds.exp(arm_worlds.noise(rng, POSES))
+    arm_worlds.save(tmp_path / "rec", world, joints, world.seen(true) * noise)
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
+    assert set(found.worth_adding) == {"arm_gear_error@100", "arm_gear_error@50"}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("waves_m", [(1.0, 0.5), (2.0, 0.8)])
+def test_a_range_that_errs_in_two_waves_is_named_in_both(tmp_path, waves_m):
+    made(tmp_path / "rec", "tiny", 3, **{f"range_cyclic@{wave}": 1.0 for wave in waves_m})
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
+    named = [name.partition("@") for name in found.worth_adding]
+    assert {family for family, _, _ in named} == {"range_cyclic"}
+    waves = sorted(float(shape) for _, _, shape in named)
+    assert waves == pytest.approx(sorted(waves_m), rel=0.01)
+
+
+def test_only_other_shapes_of_what_a_model_has_are_asked_for(tmp_path):
+    source, _ = made(tmp_path / "rec", "tiny", 1)
+    columns = frozenset(source.columns) | {"range_m"}
+
+    families = ("range_cyclic", "range_step", "near_range_bias")
+
+    def asked(*mine):
+        every = known_effects(Model(mine), [source], columns)
+        return {family: {e.shape for e in every if e.family == family} for family in families}
+
+    before, after = asked(), asked("range_cyclic@1.03", "range_step@3", "near_range_bias@0.5")
+    # Between two waves of the grid, neither is another one.
+    grid = sorted(before["range_cyclic"])
+    beside = {max(s for s in grid if s < 1.03), min(s for s in grid if s > 1.03)}
+    assert before["range_cyclic"] - after["range_cyclic"] == beside
+    assert before["range_step"] - after["range_step"] == {3.0}
+    assert before["near_range_bias"] and not after["near_range_bias"]
