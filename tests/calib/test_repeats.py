@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from calib.diagnosis.candidates import known_effects
+from calib.diagnosis.search import MOST_NEEDED
 from calib.problem.model import Model
-from calib.runs.calibrate import calibrate
+from calib.runs.calibrate import calibrate, grow, grown_model
 from calib.runs.diagnose import diagnose
 from calib.runs.explain import explain
 from calib.runs.reopen import model_of
@@ -17,11 +18,21 @@ from .simulated import made
 POSES = 120
 
 
-def arm_of(folder, seed):
+def arm_of(folder, seed, name="ur5e", poses=POSES):
     """An arm in a folder, poses of it, and the generator that drew both."""
     rng = np.random.default_rng(seed)
-    world = arm_worlds.bent(folder, "ur5e", rng, size=0.3)
-    return world, world.draw(rng, POSES), rng
+    world = arm_worlds.bent(folder, name, rng, size=0.3)
+    return world, world.draw(rng, poses), rng
+
+
+def write_erring(folder, erring, seed, name="ur5e", poses=POSES):
+    """Write an arm of which joints, by their number, err so many times a turn by so much, rad."""
+    world, joints, rng = arm_of(folder, seed, name, poses)
+    true = joints.copy()
+    for j, order, by in erring:
+        true[:, j] += by * np.sin(order * joints[:, j] + rng.uniform(0, 2 * np.pi))
+    noise = arm_worlds.exp(arm_worlds.noise(rng, poses))
+    arm_worlds.save(folder, world, joints, world.seen(true) * noise)
 
 
 def test_a_tracker_that_slips_twice_is_named_at_both_times(tmp_path):
@@ -43,14 +54,28 @@ def test_a_tracker_that_slips_twice_is_named_at_both_times(tmp_path):
 
 
 def test_a_gear_that_errs_in_two_orders_is_named_in_both(tmp_path):
-    world, joints, rng = arm_of(tmp_path / "rec", 1)
-    true = joints.copy()
-    true[:, 1] += 3e-4 * np.sin(100 * joints[:, 1] + 0.3)
-    true[:, 2] += 2e-4 * np.sin(50 * joints[:, 2] + 1.0)
-    noise = arm_worlds.exp(arm_worlds.noise(rng, POSES))
-    arm_worlds.save(tmp_path / "rec", world, joints, world.seen(true) * noise)
+    write_erring(tmp_path / "rec", [(1, 100, 3e-4), (2, 50, 2e-4)], seed=1)
     found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
     assert set(found.worth_adding) == {"arm_gear_error@100", "arm_gear_error@50"}
+
+
+# Six joints, each of which errs.
+REST = "arm_gear_error@50"
+EVERY = ((0, 2, 3e-4), (1, 1, 2.5e-4), (2, 80, 2.5e-4), (3, 1, 2e-4), (4, 50, 3e-4), (5, 2, 3e-4))
+
+
+def test_while_effects_are_missing_nothing_else_is_called_random(tmp_path):
+    """As many are named as are looked for at once. What was left was told as a tracker that
+    scatters, which then stayed in the model."""
+    write_erring(tmp_path / "rec", EVERY, 4, "kr6", 200)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
+    found = diagnose(run)
+    assert len(found.worth_adding) == MOST_NEEDED and found.scatter
+    assert not any("scatter" in name for name in found.worth_adding)
+    (said,) = (s for s in found.sentences if "tracker_scatter" in s)
+    assert said.startswith("More effects are missing beside these: add them")
+    all_of = diagnose(grow(run, grown_model(run, [*found.worth_adding, REST]), tmp_path / "all"))
+    assert all_of.verdict == "adequate" and not all_of.scatter
 
 
 @pytest.mark.long

@@ -17,6 +17,7 @@ from calib.diagnosis.chance import Chance
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import (
     ALPHA_EFFECT,
+    anything,
     judged,
     outdoing,
     outlasts,
@@ -59,6 +60,7 @@ class Search:
         beside: the last look, where blunders were judged beside formulas; see `beside_formulas`.
         scatter_judged: whether what scatters by chance was judged there, too.
         sways: the base, if its moves explain what seems to scatter.
+        more: whether as many effects are named as are at once, and another is confirmed.
     """
 
     looks: Sequence[Look]
@@ -72,6 +74,7 @@ class Search:
     beside: Look | None = None
     scatter_judged: bool = False
     sways: Sways | None = None
+    more: bool = False
 
     def dressed_up(self, i: int) -> bool:
         """Whether residual structure would have explained more than the i-th name did."""
@@ -115,6 +118,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         plain = _steps(stand, progress, most, begun=plain)
         steps = plain if _explain_all(plain, progress) else steps
     looks, found, left = steps
+    more = bool(found) and len(found) == most and anything(looks[-1], progress)
     chance: list[Chance] = []
     unsettled: Chance | None = None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
@@ -134,8 +138,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             looks, found = _left_behind([*looks, look], found)
         else:
             looks, found, left = steps = _steps(beside, progress, most)
-            if more := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
-                (looks, found, left), chance = more, []
+            if instead := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
+                (looks, found, left), chance = instead, []
                 continue
         tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
         near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
@@ -152,6 +156,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         scatter=scattering(last, progress) if most else None,
         chance=last.still(chance),
         unsettled=unsettled,
+        more=more,
     )
     by_chance = [*done.chance, *([done.unsettled] if done.unsettled else [])]
     done = replace(done, sways=sways(done.looks[-1].stand, by_chance, progress))
@@ -197,6 +202,7 @@ def nameless(done: Search, progress: Progress) -> Search:
         found=(),
         scatter=scattering(look, progress),
         chance=look.still(done.chance),
+        more=False,
     )
 
 

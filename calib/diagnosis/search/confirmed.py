@@ -67,6 +67,12 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
     return found, float(after_looks(found.p_value(), candidate.looks))
 
 
+def anything(look: Look, progress: Progress) -> bool:
+    """Whether any candidate is confirmed, in its best shape."""
+    closest = (look.closely(each, progress) for each in suspects(look.named, ALPHA_EFFECT))
+    return any(judged(near, finest, progress)[1] < ALPHA_EFFECT for near, finest in closest)
+
+
 def outlasts(look: Look, candidate: Candidate) -> bool:
     """Whether a candidate that has been fitted explains more than chance does, at the sigmas of the
     look's model, adjusted for all tests: with scatter in it these are right. As for a candidate

@@ -178,7 +178,8 @@ def conclude(
     stands_in = verdict == UNNAMED or formulas.instead
     worn = dressed_up(found, held_out, hold, formulas) if stands_in else [*formulas.needless]
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
-    deferred = not found.scatter_judged and _deferred(verdict, unsure, doubt, formulas)
+    deferred = found.more or _deferred(verdict, unsure, doubt, formulas)
+    deferred &= not found.scatter_judged
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     untestable, said = _untestable(first), unconfirmed(doubt, over) if unsure else ""
     last = [*lasting(found.blunders, first.checked, first.stand.sources)]

@@ -40,7 +40,8 @@ def candidate_documents(
     Args:
         heavy: what of the search matters.
         held_out: as of `conclude`.
-        deferred: whether scatter by chance is to be judged once structure is in the model.
+        deferred: whether scatter by chance is to be judged once what else is missing is in the
+            model.
         worn: names that stand in for it.
     """
     found = heavy.found

@@ -57,7 +57,8 @@ def sentences_of(
         if not (formulas and candidate["dressed_up"]):  # what was tried before is of no use then
             out += _step_sentences(step, candidate, found.dressed_up(i))
     scatter = _scatter_sentences(found, deferred)
-    told_later = deferred and verdict != UNNAMED  # after the structure that it speaks of
+    # After the structure that it speaks of.
+    told_later = deferred and bool(formulas) and verdict != UNNAMED
     out += [] if told_later else scatter
     out += [found.unsettled.unsettled] if found.unsettled and not found.sways else []
     out += [*heavy.refused, *traces]
@@ -95,8 +96,11 @@ def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
     if found.sways:
         rest = (c for c in found.chance if c.effect.name not in found.sways.names)
         return [found.sways.sentence, *(each.sentence for each in rest)]
-    if deferred and found.chance:
-        beside = ", ".join(each.effect.name for each in found.chance)
+    beside = ", ".join(each.effect.name for each in found.chance)
+    if deferred and found.more:
+        scatter = f"; random scatter ({beside}) is judged then" if beside else ""
+        return [f"More effects are missing beside these: add them, and diagnose again{scatter}."]
+    if deferred and beside:
         return [f"Random scatter ({beside}) is judged once that structure is in the model."]
     return [each.sentence for each in found.chance]
 
