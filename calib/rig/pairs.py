@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig import Rig
+from calib.rig.suspect import Suspect
 from chains import se3
 from chains.align import hand_eye
 from chains.errors import InputError
@@ -22,6 +23,9 @@ MOST_COMPARED = 100  # stops, each with each
 # out of step.
 AGREE = 0.3
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
+# How far the root went between two stops, rad and m alike: fits end with 0.02 m, and name it; with
+# 0.05 m they did not end. How many times further than from stop to stop elsewhere: a choice.
+PUSHED, CLEARLY = 0.02, 5.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +124,97 @@ def pairs_of(
             poses=tuple(recording.bodies[name][at] for name in names),
             d_twist=d,
         )
+
+
+@dataclass(frozen=True)
+class Push:
+    """A move of the rig's root where it should stand still.
+
+    Args:
+        bodies: that tell of it.
+        before, after: indices of the stops next to it, in time.
+        twist: (6,) by which the root went, in its own axes.
+    """
+
+    bodies: tuple[str, ...]
+    before: int
+    after: int
+    twist: Array
+
+    def suspect(self, rig: Rig, recording: RecordedStops) -> Suspect:
+        """What is said of it."""
+        before, after = (recording.stops[k] for k in (self.before, self.after))
+        turn_deg, shift_mm = np.degrees(size_of(self.twist[:3])), 1e3 * size_of(self.twist[3:])
+        where, place = "", "say 'moves: location' under 'base', and give"
+        if rig.moves == "location":
+            where, place = f" at location {recording.location[self.after]}", "give"
+        lies, lay = ("lies", "it lay") if len(self.bodies) == 1 else ("lie", "they lay")
+        said = (
+            f"from {after} on {' and '.join(self.bodies)} {lies} {shift_mm:.3g} mm and "
+            f"{turn_deg:.2g} deg from where {lay} until {before}, by what the joints say: was the "
+            "rig pushed, or the tracker set up anew? rig.yaml says that the base stands still"
+            f"{where}; {place} the stops from {after} on a location of their own"
+        )
+        size_m = float(shift_mm / 1e3)
+        return Suspect("frame", rig.tree.root, said, stops=(after,), size=size_m, unit="m")
+
+
+def pushes(pairs: Sequence[SeenPair], time_s: Array) -> tuple[list[SeenPair], list[Push]]:
+    """Moves of a root that stands still at each place, as every body that the tracker sees has it;
+    and the pairs, with a place of its own for the root after each.
+
+    Args:
+        pairs: as of `pairs_of`, those first with fewest joints below their bodies.
+        time_s: (K,) of the stops; in their own order where it is not known.
+    """
+    rank = np.argsort(np.argsort(time_s, kind="stable"))
+    alone, found = [pair for pair in pairs if len(pair.names) == 1], []
+    alone = [pair.some(np.argsort(rank[pair.stops])) for pair in alone]
+    for place in np.unique(alone[0].place).tolist() if alone else ():
+        there = [pair.some(pair.place == place) for pair in alone]
+        found += _pushes([pair for pair in there if len(pair.stops)], rank)
+    last = max((pair.place.max(initial=0) for pair in alone), default=0)
+    for new, push in enumerate(found, int(last) + 1):
+        of = {k: p for pair in alone for k, p in zip(pair.stops, pair.place, strict=True)}
+        later = {k for k, p in of.items() if p == of[push.after] and rank[k] >= rank[push.after]}
+        alone = [
+            replace(pair, place=np.where(np.isin(pair.stops, [*later]), new, pair.place))
+            for pair in alone
+        ]
+    return [*alone, *(pair for pair in pairs if len(pair.names) > 1)], found
+
+
+def _pushes(pairs: Sequence[SeenPair], rank: Array) -> list[Push]:
+    """Moves of the root at one place, as bodies have it that the tracker sees there, in the order
+    of time: the first of them tells when, and the others have to bear it out. The two stops before
+    and the two after agree; one that is off by itself is a mishap to its row."""
+    every = [pair.seen() @ se3.inverse(pair.nominal) for pair in pairs]
+    lead, twists = pairs[0], [gap_of(every[0][0], T) for T in every]
+    x, at = twists[0], np.arange(2, len(twists[0]) - 1)
+    if not len(at):
+        return []
+    moved = (x[at] + x[at + 1] - x[at - 1] - x[at - 2]) / 2
+    step = size_of(np.diff(x, axis=0))  # from each row to the next
+    usual = np.maximum(np.median(step), np.maximum(step[at - 2], step[at]))
+    far = size_of(moved) >= np.maximum(PUSHED, CLEARLY * usual)
+    names = tuple(pair.names[0] for pair in pairs)
+    return [
+        Push(names, int(lead.stops[k - 1]), int(lead.stops[k]), by)
+        for k, by in zip(at[far], moved[far], strict=True)
+        if all(
+            _borne_out(by, twist, int(np.sum(rank[pair.stops] < rank[lead.stops[k]])))
+            for pair, twist in zip(pairs[1:], twists[1:], strict=True)
+        )
+    ]
+
+
+def _borne_out(by: Array, twist: Array, at: int) -> bool:
+    """Whether another body has it, too, that the root went by (6,) before one of its rows (N, 6),
+    if it tells."""
+    if not 0 < at < len(twist):
+        return True
+    moved = twist[at : at + 2].mean(axis=0) - twist[max(at - 2, 0) : at].mean(axis=0)
+    return bool(size_of(moved - by) < size_of(by) / 2)
 
 
 def far_off(pair: SeenPair, roots: Mapping[int, Array]) -> set[int]:

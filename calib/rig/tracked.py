@@ -20,6 +20,7 @@ from calib.rig.pairs import (
     from_places,
     gap_of,
     pairs_of,
+    pushes,
     robustly_left,
     roots_of,
     size_of,
@@ -66,7 +67,9 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
         bad = yield from _placeholders(rig, recording, body)
         usable[body] = np.isfinite(recording.bodies[body]).all(axis=1) & ~bad
     met: dict[int, _Met] = {}
-    for pair in pairs_of(rig, recording, usable):
+    pairs, moves = pushes([*pairs_of(rig, recording, usable)], recording.time_s)
+    yield from (push.suspect(rig, recording) for push in moves)
+    for pair in pairs:
         wrong = _at_all_stops(pair) or _misread(rig, recording, pair)
         if wrong is not None:
             yield wrong

@@ -31,6 +31,7 @@ from calib.diagnosis.search.parts import in_place, likeliest_part
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.search.sways import Sways, sways
 from calib.diagnosis.stand import Look, Stand, tried
+from calib.effects import Effect
 from calib.solve.fit import Progress
 
 MOST_NEEDED = 3  # an explanation that needs more names than this is none: a choice
@@ -141,12 +142,9 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             if instead := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
                 (looks, found, left), chance = instead, []
                 continue
-        tested = {c.effect.name for c in looks[-1].chance}  # with it, and others that still can be
-        near = (c for c in others if strongest.statistic - c.statistic < 2 * ODDS)
-        alike = [*near, *(c for c in others if c.effect.name not in tested)]
         effects = [e for e in as_much if e.family not in {s.effect.family for s in found}]
-        rivals = dict.fromkeys(e.name for e in (*(c.effect for c in alike), *effects))
-        chance[-1] = replace(strongest, rivals=tuple(rivals))
+        rivals = [*_alike(strongest, others, looks[-1]), *effects]
+        chance[-1] = replace(strongest, rivals=tuple(dict.fromkeys(e.name for e in rivals)))
     last = looks[-1]
     done = Search(
         looks=looks,
@@ -156,7 +154,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         scatter=scattering(last, progress) if most else None,
         chance=last.still(chance),
         unsettled=unsettled,
-        more=more,
+        more=more and len(found) == most,
     )
     by_chance = [*done.chance, *([done.unsettled] if done.unsettled else [])]
     done = replace(done, sways=sways(done.looks[-1].stand, by_chance, progress))
@@ -165,6 +163,14 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
     if done.found and done.dressed_up(0):
         return replace(done, at_first=structures(done.looks[0], progress))
     return done
+
+
+def _alike(strongest: Chance, others: Sequence[Chance], beside: Look) -> list[Effect]:
+    """Others that scatter by chance as much as the strongest, or that nothing is left of once it is
+    in the model, as a look beside it has them."""
+    tested = {c.effect.name for c in beside.chance}
+    near = [c.effect for c in others if strongest.statistic - c.statistic < 2 * ODDS]
+    return [*near, *(c.effect for c in others if c.effect.name not in tested)]
 
 
 def _outlasting(

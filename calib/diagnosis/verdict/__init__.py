@@ -178,8 +178,7 @@ def conclude(
     stands_in = verdict == UNNAMED or formulas.instead
     worn = dressed_up(found, held_out, hold, formulas) if stands_in else [*formulas.needless]
     unexplained = _structure(found, verdict, formulas, rejected, doubt)
-    deferred = found.more or _deferred(verdict, unsure, doubt, formulas)
-    deferred &= not found.scatter_judged
+    deferred = _deferred(found, verdict, unsure and doubt is None, formulas)
     candidates = candidate_documents(heavy, held_out, deferred, worn)
     untestable, said = _untestable(first), unconfirmed(doubt, over) if unsure else ""
     last = [*lasting(found.blunders, first.checked, first.stand.sources)]
@@ -205,11 +204,11 @@ def conclude(
     )
 
 
-def _deferred(verdict: str, unsure: bool, doubt: Candidate | None, formulas: Unnamed) -> bool:
-    """Whether scatter is to be judged once structure is in the model; arguments as in `conclude`,
-    where nobody knows a structure if it is unsure without one in doubt."""
-    unknown = unsure and doubt is None
-    return bool(formulas.formulas) or (verdict == UNNAMED and not unknown)
+def _deferred(found: Search, verdict: str, unknown: bool, formulas: Unnamed) -> bool:
+    """Whether scatter is to be judged once what else is missing is in the model; arguments as in
+    `conclude`, where nobody knows a structure that nothing confirms if it is `unknown`."""
+    missing = found.more or formulas.formulas or (verdict == UNNAMED and not unknown)
+    return bool(missing) and not found.scatter_judged
 
 
 def _blunders(
