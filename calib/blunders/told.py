@@ -100,7 +100,7 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     """Rings with wrong numbers, in the same form; there is nothing to leave out. As sigma, how far
     off elevations are with the numbers that fit best."""
     return {
-        **_otherwise("rings", lidar, "rings", whole(found.sentence)),
+        **otherwise("rings", lidar, "rings", whole(found.sentence)),
         "size": found.off_rad,
         "unit": "rad",
         "sigma": found.left_rad,
@@ -124,7 +124,7 @@ def not_as_drawn(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, A
                 "read as the URDF has it? 'rigcal check' tries other signs and orders"
             )
             off = {"size": off_rad, "unit": "rad", "sigma": found["sigma"]}
-            yield {**_otherwise("frame", name, CAD, whole(said)), **off}
+            yield {**otherwise("frame", name, CAD, whole(said)), **off}
 
 
 def of_link(
@@ -154,7 +154,7 @@ def of_link(
         "same; fit each alone, the later with the run of the first as its --prior"
     )
     return {
-        **_otherwise("frame", name, later, whole(said)),
+        **otherwise("frame", name, later, whole(said)),
         "recording": later,
         "size": abs(change),
         "unit": unit,
@@ -177,7 +177,7 @@ def of_recording(recording: str, other: str) -> dict[str, Any]:
         f"a fit to {recording} alone comes to no optimum, and one to {other} alone does: look for "
         f"what is wrong in {recording} first, by itself"
     )
-    found = _otherwise("recording", recording, recording, whole(said))
+    found = otherwise("recording", recording, recording, whole(said))
     return {**found, "recording": recording}
 
 
@@ -221,7 +221,7 @@ def of_part(
         when = f", {off.when}" if off.when else ""
         said = f"{where} is not where it was scanned{when}: {off.said}"
     return {
-        **_otherwise("surface", name, MESH, whole(said)),
+        **otherwise("surface", name, MESH, whole(said)),
         **found,
         "at_m": at_m,
         "p_value": p,
@@ -244,17 +244,17 @@ def of_many_parts(parts: Sequence[str], when: str) -> dict[str, Any]:
         f"{since}: were they moved, was what carries the LiDAR pushed, or is its place at some "
         "stops wrong?"
     )
-    return _otherwise("surface", "many parts", MESH, whole(said))
+    return otherwise("surface", "many parts", MESH, whole(said))
 
 
 def of_scan(scan: Group, said: str) -> dict[str, Any]:
     """A scan of which a clause says what is wrong with it as a whole, in the same form."""
-    found = _otherwise("scan", scan.what, scan.where, whole(said))
+    found = otherwise("scan", scan.what, scan.where, whole(said))
     recording = scan.recording or None
     return {**found, "stop": scan.where, "recording": recording, "without": scan.token}
 
 
-def _otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:
+def otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]:
     """What was not found as a group of rows, with the keys of `document`."""
     return {
         "kind": kind,

@@ -15,6 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.diagnosis.candidates import finer, known_effects
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
+from calib.diagnosis.chance.agreeing import agreement
 from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_serial
 from calib.diagnosis.judges import Shares
@@ -277,7 +278,11 @@ class Look:
         all else in it."""
         beside = (chance.beside(self.stand.estimate) for chance in some)
         return [
-            replace(c, p_serial=p_serial(c.effect, self.others, self.blunders))
+            replace(
+                c,
+                p_serial=p_serial(c.effect, self.others, self.blunders),
+                agreement=agreement(c.effect, self.stand.estimate, self.others, self.blunders),
+            )
             for c in beside
             if c.found
         ]

@@ -22,6 +22,7 @@ from calib.blunders.chance import LEVELS, POWER, after_looks, at_least
 from calib.blunders.judged import Blunder
 from calib.blunders.others import Others
 from calib.blunders.shifts import beside_bodies, of_poses, told_by_stop
+from calib.diagnosis.chance.agreeing import Agreement
 from calib.diagnosis.chance.at_zero import AtZero
 from calib.diagnosis.chance.serial import ALPHA_SERIAL
 from calib.diagnosis.score import Scores
@@ -92,6 +93,7 @@ class Chance:
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
         p_serial: how often chance makes stops that follow each other err so much alike.
+        agreement: of most stops, where only some are off.
     """
 
     effect: Scatter
@@ -101,6 +103,7 @@ class Chance:
     detectable: float
     rivals: Sequence[str] = ()
     p_serial: float = 1.0
+    agreement: Agreement | None = None
 
     @property
     def p_adjusted(self) -> float:

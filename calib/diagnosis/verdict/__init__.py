@@ -217,7 +217,10 @@ def _blunders(
     """All that is wrong in the recordings; arguments as of `conclude`."""
     sources = found.looks[0].stand.sources
     thrown = rejected.blunders(sources, alone=not found.found) if rejected else ()
-    return [*plain, *thrown, *(told.document(left, sources) for left in found.blunders)]
+    off = [each for c in found.chance if c.agreement for each in c.agreement.blunders()]
+    # Stops that are off by the same move a frame between what they say and what others do.
+    left = (each for each in found.blunders if not (off and each.blunder.group.kind == "frame"))
+    return [*plain, *thrown, *(told.document(each, sources) for each in left), *off]
 
 
 def _caution(

@@ -51,8 +51,10 @@ def candidate_documents(
         each["matters"] = told_of.document() if told_of else None
         each["dressed_up"] = bool(each["step"]) and each["add"] in worn
     # Residual structure may be random scatter: that is judged once it is in the model.
+    no_step = [deferred or bool(each.agreement) for each in found.chance]
     chance = [
-        each.document(None if deferred else named + i) for i, each in enumerate(found.chance, 1)
+        each.document(None if no else named + i)
+        for i, (each, no) in enumerate(zip(found.chance, no_step, strict=True), 1)
     ]
     beside = found.beside if found.scatter_judged else found.looks[-1]
     others = [each.document(None) for each in beside.chance]

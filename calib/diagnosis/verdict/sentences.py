@@ -102,7 +102,7 @@ def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
         return [f"More effects are missing beside these: add them, and diagnose again{scatter}."]
     if deferred and beside:
         return [f"Random scatter ({beside}) is judged once that structure is in the model."]
-    return [each.sentence for each in found.chance]
+    return [each.sentence for each in found.chance if not each.agreement]
 
 
 def unconfirmed(candidate: Candidate | None, over: float) -> str:
