@@ -43,29 +43,36 @@ class Agreement:
         within: unit -> how far apart they are, root mean square.
         off: rows of the others, and unit -> how far off these are.
         what: in what they agree.
+        lead: the unit in which the others stand out most.
+        alike: whether they are all off by the same.
     """
 
     agree: int
     within: dict[str, float]
     off: Sequence[tuple[Group, dict[str, float]]]
     what: str
+    lead: str
+    alike: bool
 
     def blunders(self) -> Iterator[dict[str, Any]]:
         """The others, as diagnosis.json has blunders."""
+        alike = ""
+        if self.alike:
+            alike = "; all that are off are off by the same"
+            alike += ", and either half may be right" * (self.agree == len(self.off))
         for group, size in self.off:
             said = (
                 f"{group.where}: {_sizes(size)} off {self.what}; {self.agree} of "
                 f"{self.agree + len(self.off)} stops agree there within {_sizes(self.within)}, so "
-                "that is no scatter by chance. Look at its scan and at its tracked bodies."
+                f"that is no scatter by chance{alike}. Look at its scan and at its tracked bodies."
             )
-            unit = max(size, key=lambda each: size[each] / max(self.within[each], NO_SD))
             yield {
                 **otherwise(group.kind, group.what, group.where, said),
                 "stop": group.stop,
                 "recording": group.recording or None,
-                "size": size[unit],
-                "unit": unit,
-                "sigma": self.within[unit],
+                "size": size[self.lead],
+                "unit": self.lead,
+                "sigma": self.within[self.lead],
                 "without": group.token,
             }
 
@@ -144,37 +151,54 @@ def _split(
     units: np.ndarray,
     what: str,
 ) -> Agreement | None:
-    """Those of some values (K, r), of these covariances (K, r, r) if by chance, that agree, and the
-    others; None where that may be chance, or where no gap is between."""
-    count, size = values.shape
-    least = max(FEWEST_AGREEING, -(-count // 2))
-    if count < least + FEWEST_OFF_TOGETHER:
+    """Those of some values (K, r), of these covariances (K, r, r) if by chance, that agree, in all
+    or in those of one unit, and the others; None where that may be chance."""
+    every = dict.fromkeys(units.tolist())
+    looks = [np.full(len(units), True), *(units == unit for unit in every if len(every) > 1)]
+    balls = [_ball(values[:, at], covariance[:, at][:, :, at]) for at in looks]
+    p, agree = min(filter(None, balls), key=lambda ball: ball[0], default=(1.0, None))
+    if agree is None or p * len(looks) >= ALPHA_AGREE:
         return None
-    root = np.linalg.cholesky(covariance)
-    z = np.linalg.solve(root, values[..., None])[..., 0]
-    centre = z[:: -(-count // MOST_CENTRES)]
-    far = np.linalg.norm(z[None] - centre[:, None], axis=2)
-    order = np.argsort(far, axis=1)
-    reach = np.take_along_axis(far, order, axis=1)
-    most = count - FEWEST_OFF_TOGETHER
-    number = np.arange(least, most + 1)  # of those in a ball
-    inside = special.chdtr(size, np.square(reach[:, number - 1]))
-    p = count * len(number) * special.bdtrc(number - 2.0, count - 1, inside)
-    p[reach[:, number] < APART * reach[:, number - 1]] = 1.0
-    i, k = np.unravel_index(np.argmin(p), p.shape)
-    if p[i, k] >= ALPHA_AGREE:
-        return None
-    agree, rest = order[i, : number[k]], np.sort(order[i, number[k] :])
+    rest = np.setdiff1d(np.arange(len(values)), agree)
     middle = np.median(values[agree], axis=0)
     away = values - middle
 
     def by_unit(squares: np.ndarray) -> dict[str, float]:
-        every = dict.fromkeys(units.tolist())
         return {unit: float(np.sqrt(squares[units == unit].sum())) for unit in every}
 
+    within, off = (
+        by_unit(np.square(away[agree]).mean(axis=0)),
+        by_unit(np.square(away[rest]).mean(0)),
+    )
+    apart = by_unit(np.var(away[rest], axis=0))
+    lead = max(every, key=lambda unit: off[unit] / max(within[unit], NO_SD))
     return Agreement(
         agree=len(agree),
-        within=by_unit(np.square(away[agree]).mean(axis=0)),
+        within=within,
         off=[(who[j], by_unit(np.square(away[j]))) for j in rest.tolist()],
         what=what,
+        lead=lead,
+        alike=apart[lead] * APART < off[lead],
     )
+
+
+def _ball(values: np.ndarray, covariance: np.ndarray) -> tuple[float, np.ndarray] | None:
+    """How often chance makes as many of some values (K, r), of these covariances, lie together as
+    do where that is least likely; and which these are. None where no gap is around them."""
+    count, size = values.shape
+    least, most = max(FEWEST_AGREEING, -(-count // 2)), count - FEWEST_OFF_TOGETHER
+    if most < least:
+        return None
+    z = np.linalg.solve(np.linalg.cholesky(covariance), values[..., None])[..., 0]
+    z -= z.mean(axis=0)
+    z /= max(float(np.sqrt(np.square(z).mean())), NO_SD)  # by chance they are as wide as they are
+    centre = z[:: -(-count // MOST_CENTRES)]
+    far = np.linalg.norm(z[None] - centre[:, None], axis=2)
+    order = np.argsort(far, axis=1)
+    reach = np.take_along_axis(far, order, axis=1)
+    number = np.arange(least, most + 1)  # of those in a ball
+    inside = special.chdtr(size, np.square(reach[:, number - 1]))
+    p = count * len(number) * special.bdtrc(number - 2.0, count - 1, inside)
+    p[reach[:, number] < APART * reach[:, number - 1]] = np.inf
+    i, k = np.unravel_index(np.argmin(p), p.shape)
+    return (float(p[i, k]), order[i, : number[k]]) if p[i, k] < np.inf else None
