@@ -94,7 +94,9 @@ def residual_table(rows: Rows) -> dict[str, np.ndarray]:
     view = rows.view
     names = [n for n in (*_FIRST, *_PLACES) if n in view.columns]
     further = (n for n, column in view.columns.items() if not callable(column))
-    names += [n for n in further if n not in names and np.shape(view[n]) == (view.rows,)]
+    # Of a scan of one point, columns of stops are as long as those of points; names are none.
+    numbers = (n for n in further if n not in names and view[n].dtype.kind in "biuf")
+    names += [n for n in numbers if np.shape(view[n]) == (view.rows,)]
     columns = {n: view[n] for n in names} | {
         "residual_m": rows.residual_m,
         "sigma_m": np.hypot(rows.sigma_m, rows.reference_sigma_m),

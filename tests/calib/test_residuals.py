@@ -4,6 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calib.effects import Effect, Param, Site
@@ -12,11 +13,14 @@ from calib.problem.build import effect_unknown
 from calib.residuals.beams import Association, CellNumbers
 from calib.residuals.robust import tukey_weight
 from calib.residuals.store import drawn_of_each
+from calib.runs.calibrate import calibrate
+from calib.runs.run import RESIDUALS
 from sensors.lidar import Beams, beams
 
 from . import bent, rigs
 from .bent import by_variable, stop_rows
 from .rescanned import rescanned
+from .simulated import made
 
 
 @pytest.fixture(scope="module")
@@ -244,3 +248,13 @@ def test_of_each_group_some_are_drawn_that_stand_for_all_of_it(most):
         np.testing.assert_array_equal(some, np.flatnonzero(group >= 0))
     else:
         assert times.max() == min(-(-1000 // most), 700)
+
+
+def test_a_scan_of_one_point_has_a_row_of_its_own(tmp_path):
+    """Its columns of points are as long as those of stops, of which some are names."""
+    source, _ = made(tmp_path / "rec", "tiny", 1)
+    path = tmp_path / "rec" / "scans" / f"{source.recording.stops[3]}.parquet"
+    pd.read_parquet(path).iloc[[100]].to_parquet(path)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")
+    (row,) = pd.read_parquet(run.folder / RESIDUALS / path.name).to_dict("records")
+    assert np.isfinite([row["residual_m"], row["range_m"]]).all()
