@@ -37,7 +37,9 @@ from calib.effects.beams import (
     EncoderSecondHarmonic,
     NearRangeAzimuth,
     RingAzimuthOffset,
+    RingAzimuthSlip,
     RingElevationOffset,
+    RingElevationSlip,
     SpinAxisWobble,
 )
 from calib.effects.drives import (
@@ -127,6 +129,8 @@ CATALOGUE: tuple[Effect, ...] = (
     RangeQuantisation(),
     RingElevationOffset(),
     RingAzimuthOffset(),
+    RingElevationSlip(),
+    RingAzimuthSlip(),
     ElevationScale(),
     BeamOriginOffset(),
     EncoderEccentricity(),

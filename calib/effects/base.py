@@ -305,5 +305,13 @@ class ShapeStep(Effect):
         own, by = self.effect.shape, 1 + SHAPE_STEP
         ends = (own * by, own / by) if self.to is None else (self.to, own)
         sides = (self.effect.at(end) for end in ends)
-        after, before = (side.basis(view) @ self.theta[view.rig.name] for side in sides)
+        after, before = (_times(side.basis(view), self.theta[view.rig.name]) for side in sides)
         return (after - before)[..., None] / (2 * np.log1p(SHAPE_STEP) if self.to is None else 1.0)
+
+
+def _times(basis: Basis, theta: np.ndarray) -> np.ndarray:
+    """Error (rows, *shape of the site) that parameters (P,) make."""
+    if not isinstance(basis, OneHot):
+        return basis @ theta
+    of_row = np.where(basis.index < 0, 0.0, theta[basis.index])
+    return basis.values * of_row.reshape(-1, *[1] * (basis.values.ndim - 1))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.effects.base import Effect, OneHot, Param, Site, View
-from calib.effects.basis import AZIMUTH, ELEVATION, beam, range_m
+from calib.effects.basis import AZIMUTH, ELEVATION, Slips, beam, range_m
 from calib.rig import Rig
 
 NEAREST_M = 0.1  # nothing is nearer: keeps angles of offsets finite
+# Of the times between stops, those at which tables of rings are first asked for: a choice. What
+# changes halfway between two of them goes with one by 0.7 or more.
+SLIP_SHARES = (0.5,)
 
 
 class RingElevationOffset(Effect):
@@ -44,6 +49,39 @@ class RingAzimuthOffset(RingElevationOffset):
     confounded_with = ("lidar", "ring_elevation_offset", "encoder_eccentricity")
     source = "angle correction files of single units: Hesai PandarQT and PandarXT manuals"
     axis = AZIMUTH
+
+
+class RingSlips(Slips):
+    """What rings do from a time on, as their offset does all the time."""
+
+    covariates = ("ring", "elapsed_s")
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """Few, as each has a parameter for every ring; a fit goes on from the best of them."""
+        every = super().shapes(stops)
+        return tuple(every[i] for i in sorted({round(s * (len(every) - 1)) for s in SLIP_SHARES}))
+
+    def basis(self, view: View) -> OneHot:
+        whole = super().basis(view)
+        return replace(whole, values=whole.values * self.when(view["elapsed_s"])[:, None])
+
+
+class RingElevationSlip(RingSlips, RingElevationOffset):
+    """From a time on, rings point higher or lower: another table of them, as by an update."""
+
+    name = "ring_elevation_slip"
+    formula = "elevation = true + d_ring where t > t_s, t since the first stop"
+    confounded_with = ("ring_elevation_offset", "lidar_slip", "tracker_slip")
+    source = "size assumed"
+
+
+class RingAzimuthSlip(RingSlips, RingAzimuthOffset):
+    """From a time on, rings point to the side: another table of them, as by an update."""
+
+    name = "ring_azimuth_slip"
+    formula = "azimuth = true + d_ring where t > t_s, t since the first stop"
+    confounded_with = ("ring_azimuth_offset", "lidar_slip", "ring_elevation_slip")
+    source = "size assumed"
 
 
 class ElevationScale(Effect):
