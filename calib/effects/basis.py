@@ -70,9 +70,10 @@ def nearest_times(stops: View, t_s: float) -> tuple[float, ...]:
 
 
 def _between(stops: View) -> np.ndarray:
-    """Times midway between stops, three or more of them on either side."""
+    """Times midway between stops, three or more of them on either side, and any of them later."""
     time_s = np.sort(stops["elapsed_s"])
-    return (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+    between = (0.5 * (time_s[1:] + time_s[:-1]))[2:-2]
+    return between[between < time_s[-1:]] if len(between) else between
 
 
 def settled(elapsed_s: np.ndarray, tau_s: float) -> np.ndarray:

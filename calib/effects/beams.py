@@ -11,9 +11,6 @@ from calib.effects.basis import AZIMUTH, ELEVATION, Slips, beam, range_m
 from calib.rig import Rig
 
 NEAREST_M = 0.1  # nothing is nearer: keeps angles of offsets finite
-# Of the times between stops, those at which tables of rings are first asked for: a choice. What
-# changes halfway between two of them goes with one by 0.7 or more.
-SLIP_SHARES = (0.5,)
 
 
 class RingElevationOffset(Effect):
@@ -57,9 +54,10 @@ class RingSlips(Slips):
     covariates = ("ring", "elapsed_s")
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        """Few, as each has a parameter for every ring; a fit goes on from the best of them."""
+        """The middle one alone, as each has a parameter for every ring: what changes earlier or
+        later goes with it in part, and a fit that has it goes on to others."""
         every = super().shapes(stops)
-        return tuple(every[i] for i in sorted({round(s * (len(every) - 1)) for s in SLIP_SHARES}))
+        return every[len(every) // 2 :][:1]
 
     def basis(self, view: View) -> OneHot:
         whole = super().basis(view)

@@ -22,7 +22,7 @@ from calib.blunders.others import Others
 from calib.blunders.told import SHOWN, otherwise
 from calib.effects import Scatter, Site
 from calib.problem.model import labels
-from calib.residuals.groups import SCAN, Group
+from calib.residuals.groups import Group
 from calib.solve.components.told import DIRECTION_SEEN, Told, told
 from calib.solve.estimate import Estimate
 
@@ -30,7 +30,7 @@ ALPHA_AGREE = 1e-6  # the least p-value that is ever told
 FEWEST_AGREEING = 5  # stops; and of those off: a single one is a blunder for which others are asked
 FEWEST_OFF_TOGETHER = 2
 NO_SD = 1e-9  # m and rad: of what does not scatter; far below what anything tells
-APART = 3.0  # times further off than those that agree is the nearest of the others: a choice
+GAP_AROUND = 3.0  # times further off than those that agree is the nearest of the others: a choice
 MOST_CENTRES = 500  # about which balls are looked at, evenly chosen
 
 
@@ -110,14 +110,11 @@ def _of_values(effect: Scatter, estimate: Estimate, others: Others) -> Iterator[
             sd = np.maximum(unknown.sigma, NO_SD).reshape(len(names), size)
             wide = covariance + np.square(sd)[:, :, None] * np.eye(size)
             seen = np.isfinite(wide).all(axis=(1, 2))
-            who = [Group("scan", n.removeprefix(term.effect.label), SCAN, label) for n in names]
-            units = np.array(unknown.units[:size])
-            known = [k for k in np.flatnonzero(seen) if _there(who[k], others)]
-            yield _split(values[known], wide[known], [who[k] for k in known], units, effect.what)
-
-
-def _there(group: Group, others: Others) -> bool:
-    return any(scan.group == group for scan in others.problem.scans)
+            scans = (s.group for s in problem.scans if s.group.recording == label)
+            who = {f"{term.effect.label}{group.where}": group for group in scans}
+            known = [k for k in np.flatnonzero(seen).tolist() if names[k] in who]
+            groups, units = [who[names[k]] for k in known], np.array(unknown.units[:size])
+            yield _split(values[known], wide[known], groups, units, effect.what)
 
 
 def _by_themselves(rows: Told, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +175,7 @@ def _split(
         off=[(who[j], by_unit(np.square(away[j]))) for j in rest.tolist()],
         what=what,
         lead=lead,
-        alike=apart[lead] * APART < off[lead],
+        alike=apart[lead] * GAP_AROUND < off[lead],
     )
 
 
@@ -199,6 +196,6 @@ def _ball(values: np.ndarray, covariance: np.ndarray) -> tuple[float, np.ndarray
     number = np.arange(least, most + 1)  # of those in a ball
     inside = special.chdtr(size, np.square(reach[:, number - 1]))
     p = count * len(number) * special.bdtrc(number - 2.0, count - 1, inside)
-    p[reach[:, number] < APART * reach[:, number - 1]] = np.inf
+    p[reach[:, number] < GAP_AROUND * reach[:, number - 1]] = np.inf
     i, k = np.unravel_index(np.argmin(p), p.shape)
     return (float(p[i, k]), order[i, : number[k]]) if p[i, k] < np.inf else None
