@@ -28,7 +28,9 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
-from calib.solve.turned import OtherAxes, axes_of, lidars_turned
+from calib.solve.otherwise.axes import OtherAxes, axes_of
+from calib.solve.otherwise.orientations import lidars_turned
+from calib.solve.otherwise.readings import readings_of
 from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
@@ -213,10 +215,14 @@ class _Checker:
         readable = [scan for scan in problem.scans if scan.name in scans.points]
         problem.scans = readable[:: -(-len(readable) // MOST_SCANS) or 1]
         values = problem.initial
-        if turned := lidars_turned(problem, values):
-            values = {**values, **turned}
-            self._tell([_turned(problem.scans[0], problem.initial, values)])
-        self._tell(map(_other_axes, axes_of(problem, values, turned)))
+        turned = lidars_turned(problem, values)
+        if written := [*readings_of(problem, values, turned)]:
+            self._tell(written)
+        else:
+            if turned:
+                values = {**values, **turned}
+                self._tell([_turned(problem.scans[0], problem.initial, values)])
+            self._tell(map(_other_axes, axes_of(problem, values, turned)))
         kept, placed = [], []
         for i, scan in enumerate(problem.scans):
             self.progress("placing scans", i, len(problem.scans))
