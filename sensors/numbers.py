@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     import pandas
 
 LONGEST_NUMBER = 32  # characters
-OTHER_SEPARATORS = {
-    ";": "';'",
-    "\t": "tabs",
-}  # as spreadsheets write them, and what they are called
+# Of columns, as spreadsheets write them, and what they are called.
+OTHER_SEPARATORS = {";": "';'", "\t": "tabs"}
 
 
 def parse_numbers(text: bytes) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from calib.results.check import check
@@ -70,7 +71,57 @@ def test_poses_that_are_written_otherwise_are_told(recordings, tmp_path, name, c
     assert suspect["name"] == "markers" and suspect["without"] is None and not found.command
 
 
-def test_nothing_is_told_of_sound_ones(recordings):
-    for name, folder in recordings.items():
-        told = [line for line in check(folder).odd if line.startswith("the scans")]
-        assert told == [], name
+@pytest.mark.parametrize("name", WORLDS)
+def test_nothing_is_told_of_sound_ones(recordings, name):
+    assert [line for line in check(recordings[name]).odd if line.startswith("the scans")] == []
+
+
+# ------------------------------------------------------------------------------------- left-handed
+
+MIRRORS = {  # what of the tracker's x, y, z is written, and its sign
+    "y": ([0, 1, 2], [1, -1, 1]),
+    "z": ([0, 1, 2], [1, 1, -1]),
+    "y and z exchanged": ([0, 2, 1], [1, 1, 1]),
+}
+
+
+def mirrored(folder, order, sign):
+    """All that the tracker says of targets, in a left-handed world."""
+    table = pd.read_csv(folder / "targets.csv")
+    for part in ("upper", "lower"):
+        columns = [f"{part}_{axis}" for axis in "xyz"]
+        table[columns] = table[columns].to_numpy()[:, order] * sign
+    table.to_csv(folder / "targets.csv", index=False)
+
+
+@pytest.mark.parametrize(("order", "sign"), MIRRORS.values(), ids=MIRRORS)
+def test_no_sphere_is_blamed_where_all_are_mirrored(recordings, tmp_path, order, sign):
+    folder = shutil.copytree(recordings["hand"], tmp_path / "other")
+    mirrored(folder, order, sign)
+    (told,) = [s for s in check(folder, graph=False).odd if "targets" in s]
+    assert told.startswith("tracker and scanner place all targets within ")
+    assert "left-handed" in told
+
+
+def test_one_sphere_elsewhere_is_named(recordings, tmp_path):
+    """No mirror sets right what is wrong with one."""
+    folder = shutil.copytree(recordings["hand"], tmp_path / "other")
+    table = pd.read_csv(folder / "targets.csv")
+    table.loc[0, "faro_x"] += 0.3
+    table.to_csv(folder / "targets.csv", index=False)
+    assert [s["name"] for s in check(folder, graph=False).suspects] == [table.target[0]]
+
+
+def test_a_left_handed_export_of_all_is_told_of_bodies_and_targets(recordings, tmp_path):
+    folder = shutil.copytree(recordings["hand"], tmp_path / "other")
+    rewritten(folder, left_handed)
+    mirrored(folder, *MIRRORS["y"])
+    found = check(folder)
+    assert [(s["kind"], s["name"]) for s in found.suspects] == [
+        ("target", "handedness"),
+        ("body", "markers"),
+    ]
+    assert not found.command
+    (told,) = [line for line in found.odd if line.startswith("the scans")]
+    assert "x, -y, z and qw, -qx, qy, -qz of markers in place" in told
+    assert told.endswith("write them so, and x, -y, z of upper and lower in targets.csv")
