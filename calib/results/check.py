@@ -31,6 +31,7 @@ from calib.solve.fit import Progress, preview
 from calib.solve.otherwise.axes import OtherAxes, axes_of
 from calib.solve.otherwise.orientations import lidars_turned
 from calib.solve.otherwise.readings import readings_of
+from calib.solve.otherwise.rooms import rooms_turned
 from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
@@ -222,7 +223,10 @@ class _Checker:
             if turned:
                 values = {**values, **turned}
                 self._tell([_turned(problem.scans[0], problem.initial, values)])
-            self._tell(map(_other_axes, axes_of(problem, values, turned)))
+            rooms = [*rooms_turned(problem, values)]
+            self._tell(room.sentence for room in rooms)
+            if not any(room.is_better for room in rooms):
+                self._tell(map(_other_axes, axes_of(problem, values, turned)))
         kept, placed = [], []
         for i, scan in enumerate(problem.scans):
             self.progress("placing scans", i, len(problem.scans))

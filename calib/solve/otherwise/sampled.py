@@ -48,6 +48,14 @@ class Sampled:
         T_world_reference = values[outer]
         return se3.inverse(T_world_reference) @ maps(axes) @ T_world_reference @ self.T
 
+    def some(self, most: int) -> Beams:
+        """About so many of its beams, in the mesh's frame."""
+        _, ray = self.scan.store.read(self.scan.index)
+        some = np.unique(np.linspace(0, len(ray.range_m) - 1, most).round().astype(int))
+        R = self.T[:3, :3]
+        origin_m = se3.apply(self.T, ray.origin_m[some])
+        return Beams(origin_m, ray.direction[some] @ R.T, ray.range_m[some])
+
     def off_m(self, at: np.ndarray) -> np.ndarray:
         """Mean error (G,) of some beams, of maps (G, 4, 4) from the LiDAR's frame to the mesh's."""
         _, ray = self.scan.store.read(self.scan.index)
