@@ -27,9 +27,9 @@ LAID_BY, JUDGED_BY = 200, 1500
 NARROWED_M = (0.5, 0.5, 0.3, 0.3, 0.2, 0.1, 0.1, 0.05, 0.05)
 LAID_WITHIN = np.repeat([0.3, 0.5], 3)  # rad, m: one sigma of what that moves; a choice
 # Share of a scan's beams that fit in one way and not in the other, on average: less is alike. In
-# bare boxes it is 0.0001 and less; 0.006 to 0.03 where one box of half a metre stands in them; 0.1
-# and more in 20 furnished rooms.
-ALIKE = 0.003
+# bare rooms it is 0.001 and less; 0.005 to 0.04 where one box of 0.6 to 1.2 m stands in them; 0.1
+# and more in 20 furnished ones.
+FITS_ALIKE = 0.003
 # How many scans have to fit notably better turned, and how much worse others then may: a choice.
 # In 48 recordings of rooms with one box the right way round made none notably worse; one wrong way
 # against another as many as it made better.
@@ -106,13 +106,13 @@ def _is_better(turned: np.ndarray, as_is: np.ndarray) -> bool:
     notably worse."""
     by = as_is - turned
     better, worse = by.clip(min=0.0).sum(), -by.clip(max=0.0).sum()
-    enough = np.count_nonzero(by > NOTABLY) >= FEWEST_BETTER and by.mean() > ALIKE
+    enough = np.count_nonzero(by > NOTABLY) >= FEWEST_BETTER and by.mean() > FITS_ALIKE
     return bool(enough and worse < WORSE * better and turned.mean() < FITS_AT_ALL)
 
 
 def _alike(turned: np.ndarray, as_is: np.ndarray) -> bool:
     """Whether scans (K,) fit, and each turned as well as it is."""
-    return bool(as_is.mean() < FITS_AT_ALL and np.abs(as_is - turned).mean() < ALIKE)
+    return bool(as_is.mean() < FITS_AT_ALL and np.abs(as_is - turned).mean() < FITS_ALIKE)
 
 
 def _costs(problem: Problem, scans: Sequence[Sampled]) -> dict[int, np.ndarray]:
