@@ -76,6 +76,15 @@ def test_nothing_is_told_of_sound_ones(recordings, name):
     assert [line for line in check(recordings[name]).odd if line.startswith("the scans")] == []
 
 
+def test_a_body_that_is_seen_where_nothing_was_scanned_says_nothing(recordings, tmp_path):
+    folder = shutil.copytree(recordings["guessed"], tmp_path / "other")
+    seen = np.arange(8)[:, None] == 0
+    rewritten(folder, lambda pose: np.where(seen, inverted(pose), np.nan))
+    (folder / "scans" / "L00P00.parquet").unlink()
+    found = check(folder)
+    assert found.problems == [] and not any("poses of" in line for line in found.odd)
+
+
 # ------------------------------------------------------------------------------------- left-handed
 
 MIRRORS = {  # what of the tracker's x, y, z is written, and its sign

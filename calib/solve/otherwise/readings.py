@@ -155,8 +155,11 @@ def readings_of(problem: Problem, values: Values, turned: Values) -> Iterator[Su
         if body is None or number in done:
             continue
         seen = np.isfinite(source.recording.bodies[body]).all(axis=1)
-        chosen = asked([each for each in scans if seen[each.scan.index]] or scans[:0])
-        as_is_m = turned_off_m(chosen, np.eye(3)[None])[0] if chosen else 0.0
+        told = [each for each in scans if seen[each.scan.index]]
+        if not told:
+            continue
+        chosen = asked(told)
+        as_is_m = turned_off_m(chosen, np.eye(3)[None])[0]
         if as_is_m < NEAR_M:
             continue
         found = _fitting(source, body, chosen, values, as_is_m)
