@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     import pandas
 
 LONGEST_NUMBER = 32  # characters
+# Of columns, as spreadsheets write them, and what they are called.
+OTHER_SEPARATORS = {";": "';'", "\t": "tabs"}
 
 
 def parse_numbers(text: bytes) -> NDArray[np.float64]:
@@ -54,7 +56,10 @@ def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarr
     named in `text` are text always. Raises InputError naming the row of a ragged line, or the
     column that stands in the header twice.
     """
-    lines = csv.reader(read_text(path).splitlines())
+    whole = read_text(path)
+    if not whole.strip():
+        raise InputError(f"{path}: the file is empty; its first line has to name the columns")
+    lines = csv.reader(whole.splitlines())
     try:
         return _columns_of(path, lines, text)
     except csv.Error as error:
@@ -64,8 +69,11 @@ def read_csv(path: str | Path, text: Collection[str] = ()) -> dict[str, np.ndarr
 def _columns_of(path: str | Path, lines: Any, text: Collection[str]) -> dict[str, np.ndarray]:
     header = [escape.from_csv_cell(name.strip()) for name in next(lines, [])]
     times = Counter(header)
-    if len(header) <= 1 and ";" in "".join(header):
-        raise InputError(f"{path}:1: columns are separated by ';' here; separate them by commas")
+    for mark, name in (OTHER_SEPARATORS if len(header) <= 1 else {}).items():
+        if mark in "".join(header):
+            raise InputError(
+                f"{path}:1: columns are separated by {name} here; separate them by commas"
+            )
     for name in header:
         if not name or times[name] > 1:
             raise InputError(f"{path}:1: every column needs its own name, and {name!r} is not one")

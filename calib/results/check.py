@@ -28,7 +28,10 @@ from calib.rig.suspect import Suspect
 from calib.rig.tracked import odd_bodies
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, preview
-from calib.solve.turned import OtherAxes, axes_of, lidars_turned
+from calib.solve.otherwise.axes import OtherAxes, axes_of
+from calib.solve.otherwise.orientations import lidars_turned
+from calib.solve.otherwise.readings import readings_of
+from calib.solve.otherwise.rooms import rooms_turned
 from chains import remote, se3
 from chains.errors import InputError
 from sensors.recording import RecordedStops, read_scan
@@ -213,10 +216,19 @@ class _Checker:
         readable = [scan for scan in problem.scans if scan.name in scans.points]
         problem.scans = readable[:: -(-len(readable) // MOST_SCANS) or 1]
         values = problem.initial
-        if turned := lidars_turned(problem, values):
-            values = {**values, **turned}
-            self._tell([_turned(problem.scans[0], problem.initial, values)])
-        self._tell(map(_other_axes, axes_of(problem, values, turned)))
+        turned = lidars_turned(problem, values)
+        # What bodies say of each other, or joints of a body, is said already.
+        known = any(s["kind"] == "body" and s["stop"] is None for s in self.found.suspects)
+        if written := [] if known else [*readings_of(problem, values, turned)]:
+            self._tell(written)
+        else:
+            if turned:
+                values = {**values, **turned}
+                self._tell([_turned(problem.scans[0], problem.initial, values)])
+            rooms = [*rooms_turned(problem, values)]
+            self._tell(room.sentence for room in rooms)
+            if not any(room.is_better for room in rooms):
+                self._tell(map(_other_axes, axes_of(problem, values, turned)))
         kept, placed = [], []
         for i, scan in enumerate(problem.scans):
             self.progress("placing scans", i, len(problem.scans))

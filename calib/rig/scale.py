@@ -19,6 +19,9 @@ from sensors.stops import Targets
 # A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
 APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
+# Of how far spheres lie apart, what is left where they are mirrored: a choice. All of 0.27 m but
+# 1 mm went where they were.
+LEFT_MIRRORED = 0.2
 UPWARDS = 0.9  # a choice, of the cosine: scanners are level to a degree, and have z up
 SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
 # In a metre.
@@ -35,7 +38,7 @@ ROOM_ACROSS = 2.5  # times the distance of their walls, rooms are across from co
 
 def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
     """Rods that hang askew, lengths that differ between tracker and scanner, and spheres that both
-    see at different places."""
+    see at different places, or one of the two mirrored."""
     names, rods = np.array(targets.names), targets.lower_m - targets.upper_m
     rods = rods / np.linalg.norm(rods, axis=1, keepdims=True)
     down = np.median(rods, axis=0)
@@ -54,7 +57,7 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
         return
     there_m = se3.apply(T_world_reference, targets.faro_m)
     off_m = np.linalg.norm(sphere_m - there_m, axis=1)
-    differing = _ratio(sphere_m, there_m, spec)
+    differing, mirrored_m = _ratio(sphere_m, there_m, spec), _mirrored_off_m(sphere_m, targets)
     if off_m.max() < APART_M and (T_world_reference[:3, :3].T @ down)[2] > UPWARDS:
         yield (
             "by upper and lower of targets.csv the rods stand upwards in the scanner's frame; are "
@@ -64,6 +67,13 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
         other = np.flatnonzero(order != np.arange(len(order)))
         pairs = ", ".join(f"{names[order[k]]} is the tracker's {names[k]}" for k in other)
         yield f"scanner and tracker number targets otherwise: the scanner's {pairs}"
+    elif off_m.max() > APART_M and mirrored_m < min(APART_M, LEFT_MIRRORED * off_m.max()):
+        said = (
+            f"tracker and scanner place all targets within {max(1e3 * mirrored_m, 1.0):.0f} mm if "
+            f"one of the two is mirrored, and up to {1e3 * off_m.max():.0f} mm apart as they are: "
+            "are the tracker's coordinates left-handed, or two of their columns exchanged?"
+        )
+        yield Suspect("target", "handedness", said)
     elif differing is not None and not askew.any():
         yield differing
     elif off_m.max() > APART_M:
@@ -73,6 +83,13 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
         )
         size_m = float(off_m.max())
         yield Suspect("target", str(names[off_m.argmax()]), said, size=size_m, unit="m")
+
+
+def _mirrored_off_m(tracked_m: np.ndarray, targets: Targets) -> float:
+    """How far (m) at most spheres of a tracker (M, 3) m, mirrored, lie from those of a scanner."""
+    mirrored_m = tracked_m * [1.0, -1.0, 1.0]  # across any plane: what is left is a pose
+    T, _ = align_points(mirrored_m, targets.faro_m)
+    return float(np.linalg.norm(mirrored_m - se3.apply(T, targets.faro_m), axis=1).max())
 
 
 def _renumbered(tracked_m: np.ndarray, scanned_m: np.ndarray) -> np.ndarray | None:

@@ -16,8 +16,9 @@ from calib.solve.around import look_around
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, rest_of, values_of
 from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
+from calib.solve.otherwise.orientations import lidars_turned
 from calib.solve.reweight import reweighted
-from calib.solve.turned import least_turned, lidars_turned, turned_far
+from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
 
 ROUNDED = 1e-6  # of a cost: how far apart a fit's end and a look at it may be

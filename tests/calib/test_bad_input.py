@@ -75,6 +75,8 @@ UNREADABLE = {
     "labels": (text("reference/labels.yaml", lambda t: "[floor]\n"), "labels.yaml", "0: floor"),
     "ragged stops": (text(STOPS, lambda t: t.rstrip() + ",1\n"), "stops.csv:5", "cells"),
     "semicolons": (text(STOPS, lambda t: t.replace(",", ";")), "stops.csv:1", "commas"),
+    "tabs": (text(STOPS, lambda t: t.replace(",", "\t")), "stops.csv:1", "by tabs", "commas"),
+    "empty stops": (text(STOPS, lambda t: ""), "stops.csv: the file is empty", "columns"),
 }
 TYPES = {
     "joint": (cells(STOPS, "joint_2", "abc", 1), "row 2 (L00P01)", "joint_2 is 'abc'"),

@@ -20,7 +20,8 @@ from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.solve.fit import solve
-from calib.solve.turned import axes_of, lidars_turned
+from calib.solve.otherwise.axes import axes_of
+from calib.solve.otherwise.orientations import lidars_turned
 from chains import se3
 
 from ..worlds import World, write

@@ -200,6 +200,9 @@ def test_csv_without_rows_has_empty_columns(write):
         ("a,b,a\n1,2,3\n", r"a\.csv:1: every column needs its own name, and 'a'"),
         ("a,,b\n1,2,3\n", r"a\.csv:1: every column needs its own name, and ''"),
         ("a;b\n1;2\n", r"a\.csv:1: columns are separated by ';'"),
+        ("a\tb\n1\t2\n", r"a\.csv:1: columns are separated by tabs here; .* commas"),
+        ("", r"a\.csv: the file is empty"),
+        (" \n\n", r"a\.csv: the file is empty"),
     ],
 )
 def test_csv_complaints_name_the_line(write, text, sentence):
