@@ -107,6 +107,11 @@ def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
     }
 
 
+def of_room(frame: str, sentence: str) -> dict[str, Any]:
+    """A room, of this frame, that a guess has the wrong way round, in the same form."""
+    return otherwise("frame", frame, CAD, whole(sentence))
+
+
 def not_as_drawn(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, Any]]:
     """Angles of an arm that are far from where they are drawn, in the same form: no arm is built so
     far off, and a fit gets there where joints are read otherwise than the URDF has them.

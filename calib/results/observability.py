@@ -13,6 +13,7 @@ from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
 from calib.solve.estimate import Estimate
+from calib.solve.otherwise.rooms import rooms_turned
 
 UNTOLD = 0.98  # of the prior's variance left: a choice; the data took 1 % off the prior's sigma
 # Of a scan's beams on planes: from which it sees a plane, up to which the others hardly do, and how
@@ -25,11 +26,13 @@ PARTNER = 0.1
 
 
 def odd(estimate: Estimate) -> list[str]:
-    """Which numbers and scans of the recordings are hardly what they are taken for; clauses."""
+    """Which numbers, scans and guesses are hardly what they are taken for, or might be others;
+    clauses."""
     sources = [(s.rig, s.recording) for s in estimate.problem.sources]
     numbers = [each for rig, stops in sources for each in (*odd_rig(rig), *odd_numbers(rig, stops))]
     alone = seen_alone(estimate)
-    return [*numbers, *([shown_by_no_other(alone)] if alone else [])]
+    rooms = [room.sentence for room in rooms_turned(estimate.problem, estimate.values)]
+    return [*numbers, *([shown_by_no_other(alone)] if alone else []), *rooms]
 
 
 def seen_alone(estimate: Estimate) -> list[Group]:

@@ -46,6 +46,7 @@ from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
+from calib.solve.otherwise.rooms import rooms_turned
 from sensors.documents import write_json
 
 
@@ -93,6 +94,7 @@ def _found(
     if between:  # what moved once, between two recordings, seems to scatter, or contradicts all
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
         found, suspect = replace(found, chance=(), **kept), []
+    rooms = rooms_turned(stand.problem, stand.estimate.values)
     result = conclude(
         found,
         falls,
@@ -104,6 +106,7 @@ def _found(
             *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
             *_not_as_drawn(run, found),
             *(told.of_scan(s, shown_by_no_other([s])) for s in seen_alone(stand.estimate)),
+            *(told.of_room(r.frame, r.sentence) for r in rooms if r.is_better),
             *between,
         ],
         formulas,
@@ -257,7 +260,9 @@ def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
     wrong = [(each["where"], each["name"]) for each in found.blunders]
     uneven = [(b.group.where, b.group.what) for b in look.blunders if b.uneven and not b.found]
     named = tuple(f"{where}, {what}:" for where, what in (*wrong, *uneven))
-    return [each for each in cautions(run) if not each.startswith(named)]
+    said = {each["sentence"] for each in found.blunders}
+    every = (each for each in cautions(run) if not each.startswith(named))
+    return [each for each in every if told.whole(each) not in said]
 
 
 def _command(run: Run, found: Diagnosis) -> str:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from calib.results.check import check
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from chains import se3
 
 from ..worlds import room
@@ -95,3 +97,20 @@ def test_where_only_a_guess_tells_it_is_said(tmp_path, name, by, degrees, tracke
 
 def test_nothing_is_said_where_targets_tell(tmp_path):
     assert told(recorded(tmp_path / "rec", "bare", targets=True)) == []
+
+
+def test_a_fit_that_ended_the_wrong_way_round_is_not_to_be_used(tmp_path):
+    """It converges, and its error is as expected but for what the box does to a few beams."""
+    folder = recorded(tmp_path / "rec", "one box", 180, tracked=True)
+    run = calibrate([folder], tmp_path / "run", hold_out="none")
+    found = diagnose(run)
+    assert found.verdict == "bad_data"
+    first = found.blunders[0]
+    assert first["sentence"].startswith(BETTER.replace("the", "The", 1)) and not first["without"]
+    assert sum(first["sentence"] in said for said in found.sentences) == 1
+
+
+def test_a_fit_says_where_only_a_guess_tells(tmp_path):
+    run = calibrate([recorded(tmp_path / "rec", "bare")], tmp_path / "run", hold_out="none")
+    (said,) = (each for each in run.summary["odd"] if "room" in each)
+    assert said.startswith(LIKE) and "base_guess alone" in said

@@ -54,6 +54,11 @@ class TurnedRoom:
     is_better: bool
 
     @property
+    def frame(self) -> str:
+        """That of the mesh."""
+        return self.source.rig.reference_frame
+
+    @property
     def sentence(self) -> str:
         """What to look at."""
         rig = self.source.rig
