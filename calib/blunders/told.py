@@ -31,9 +31,9 @@ def groups(
     others: Mapping[str, Mapping[str, float]],
     unseen: Mapping[Group, FurthestMoved],
 ) -> dict[str, Any]:
-    """How far out every group that was looked at is, and the size from which a mishap to it, or to
-    what is no group of rows, would be found, and how far one that is not would move an estimate, as
-    diagnosis.json has them; of a group that is there twice, as it is at first."""
+    """How far out every group that was looked at is, the size from which a mishap to it, or to what
+    is no group of rows, is found, and how far one that is not would move an estimate, as in
+    diagnosis.json; of a group that is there twice, as it is at first."""
     first: dict[str, Blunder] = {}
     sizes: dict[str, dict[str, float]] = {}
     for blunder in looked_at:
@@ -97,8 +97,8 @@ def document(left: LeftOut, sources: Sequence[Source]) -> dict[str, Any]:
 
 
 def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
-    """Rings with wrong numbers, in the same form; there is nothing to leave out. As sigma, how far
-    off elevations are with the numbers that fit best."""
+    """Rings with wrong numbers, in the same form. As sigma, how far off the best numbers leave
+    elevations."""
     return {
         **otherwise("rings", lidar, "rings", whole(found.sentence)),
         "size": found.off_rad,
@@ -271,8 +271,7 @@ def otherwise(kind: str, name: str, where: str, sentence: str) -> dict[str, Any]
         "at_m": None,
         "wrong_sign": None,
         "offset": None,
-        "p_value": LEAST_P,  # chance puts no ring in another's place
-        "p_adjusted": LEAST_P,
+        **dict.fromkeys(("p_value", "p_adjusted"), LEAST_P),  # what chance does not do
         "detectable": {},
         "indistinguishable_from": [],
         "belongs_to": None,

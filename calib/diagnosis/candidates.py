@@ -44,6 +44,8 @@ def known_effects(
 def _others(effect: Effect, grid: Sequence[float], model: Model) -> list[float]:
     """The shapes of a grid that a model has not. Next to a smooth one that it has, another only
     says that this one is a little off; so of these, one of the grid lies between."""
+    if not len(grid):
+        return []
     shapes, number = np.array(grid), np.arange(len(grid))
     there = np.zeros(len(grid), bool)
     for mine in (e.shape for e in model.effects if e.family == effect.family):

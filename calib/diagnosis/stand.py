@@ -15,7 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.diagnosis.candidates import finer, known_effects
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
-from calib.diagnosis.chance.agreeing import agreement
+from calib.diagnosis.chance.agreeing import agreements
 from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_serial
 from calib.diagnosis.judges import Shares
@@ -281,7 +281,7 @@ class Look:
             replace(
                 c,
                 p_serial=p_serial(c.effect, self.others, self.blunders),
-                agreement=agreement(c.effect, self.stand.estimate, self.others, self.blunders),
+                agreements=agreements(c.effect, self.stand.estimate, self.others, self.blunders),
             )
             for c in beside
             if c.found

@@ -52,6 +52,7 @@ class RingSlips(Slips):
     """What rings do from a time on, as their offset does all the time."""
 
     covariates = ("ring", "elapsed_s")
+    repeats = False  # of the one time that is asked for nothing would be left
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """The middle one alone, as each has a parameter for every ring: what changes earlier or

@@ -135,7 +135,9 @@ def _lacking(scene: PlanningScene, poses: Poses | None) -> dict[str, tuple[Effec
         sources = problem.sources
         columns = frozenset(sources[0].columns).union(*(view.columns for view in seen))
     families: dict[str, list[Effect]] = {}
-    for effect in known_effects(stand.model, sources, columns, stand.catalogue):
+    there = {effect.family for effect in stand.model.effects}
+    catalogue = [effect for effect in stand.catalogue if effect.family not in there]
+    for effect in known_effects(stand.model, sources, columns, catalogue):
         if effect.site is not Site.NOISE and not effect.by_chance:
             families.setdefault(effect.family, []).append(effect)
     middle = {name: some[len(some) // 2] for name, some in families.items()}

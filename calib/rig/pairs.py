@@ -169,9 +169,10 @@ def pushes(pairs: Sequence[SeenPair], time_s: Array) -> tuple[list[SeenPair], li
     """
     rank = np.argsort(np.argsort(time_s, kind="stable"))
     alone, found = [pair for pair in pairs if len(pair.names) == 1], []
-    alone = [pair.some(np.argsort(rank[pair.stops])) for pair in alone]
-    for place in np.unique(alone[0].place).tolist() if alone else ():
-        there = [pair.some(pair.place == place) for pair in alone]
+    in_time = [pair.some(np.argsort(rank[pair.stops])) for pair in alone]
+    places = [pair.place for pair in alone] or [np.zeros(0, int)]
+    for place in np.unique(np.concatenate(places)).tolist():
+        there = [pair.some(pair.place == place) for pair in in_time]
         found += _pushes([pair for pair in there if len(pair.stops)], rank)
     last = max((pair.place.max(initial=0) for pair in alone), default=0)
     for new, push in enumerate(found, int(last) + 1):
@@ -186,33 +187,40 @@ def pushes(pairs: Sequence[SeenPair], time_s: Array) -> tuple[list[SeenPair], li
 
 def _pushes(pairs: Sequence[SeenPair], rank: Array) -> list[Push]:
     """Moves of the root at one place, as bodies have it that the tracker sees there, in the order
-    of time: the first of them tells when, and the others have to bear it out. The two stops before
-    and the two after agree; one that is off by itself is a mishap to its row."""
-    every = [pair.seen() @ se3.inverse(pair.nominal) for pair in pairs]
-    lead, twists = pairs[0], [gap_of(every[0][0], T) for T in every]
-    x, at = twists[0], np.arange(2, len(twists[0]) - 1)
+    of time: that which it sees most often tells when, and the others have to bear it out. The two
+    stops before and the two after agree; one that is off by itself is a mishap to its row."""
+    lead = max(pairs, key=lambda pair: len(pair.stops))
+    T_lead = lead.seen() @ se3.inverse(lead.nominal)
+    x, at = gap_of(T_lead[0], T_lead), np.arange(2, len(T_lead) - 1)
     if not len(at):
         return []
+    others = [
+        (pair, gap_of(T_lead[0], pair.seen() @ se3.inverse(pair.nominal)))
+        for pair in pairs
+        if pair is not lead
+    ]
     moved = (x[at] + x[at + 1] - x[at - 1] - x[at - 2]) / 2
     step = size_of(np.diff(x, axis=0))  # from each row to the next
     usual = np.maximum(np.median(step), np.maximum(step[at - 2], step[at]))
     far = size_of(moved) >= np.maximum(PUSHED, CLEARLY * usual)
-    names = tuple(pair.names[0] for pair in pairs)
-    return [
-        Push(names, int(lead.stops[k - 1]), int(lead.stops[k]), by)
-        for k, by in zip(at[far], moved[far], strict=True)
-        if all(
-            _borne_out(by, twist, int(np.sum(rank[pair.stops] < rank[lead.stops[k]])))
-            for pair, twist in zip(pairs[1:], twists[1:], strict=True)
-        )
-    ]
+    found = []
+    for k, by in zip(at[far].tolist(), moved[far], strict=True):
+        before, after = (int(lead.stops[i]) for i in (k - 1, k))
+        said = {
+            pair.names[0]: _borne_out(by, twist, int(np.sum(rank[pair.stops] < rank[after])))
+            for pair, twist in others
+        }
+        if False not in said.values():
+            bodies = tuple(p.names[0] for p in pairs if p is lead or said[p.names[0]])
+            found.append(Push(bodies, before, after, gap_of(T_lead[k - 1], T_lead[k])))
+    return found
 
 
-def _borne_out(by: Array, twist: Array, at: int) -> bool:
-    """Whether another body has it, too, that the root went by (6,) before one of its rows (N, 6),
-    if it tells."""
+def _borne_out(by: Array, twist: Array, at: int) -> bool | None:
+    """Whether another body has it, too, that the root went by (6,) before one of its rows (N, 6);
+    None where it does not tell."""
     if not 0 < at < len(twist):
-        return True
+        return None
     moved = twist[at : at + 2].mean(axis=0) - twist[max(at - 2, 0) : at].mean(axis=0)
     return bool(size_of(moved - by) < size_of(by) / 2)
 

@@ -208,3 +208,15 @@ def test_a_rig_that_stands_and_a_body_that_moves_alone_are_no_push(tmp_path):
     found = check(tmp_path / "rec", graph=False).suspects
     assert {s["kind"] for s in found} == {"body"}
     assert {s["stop"] for s in found} <= {f"L01P0{k}" for k in range(6)}
+
+
+def test_what_is_off_is_told_alike_in_any_order_of_the_rows(tmp_path):
+    told_of(tmp_path / "rec")
+    table = pd.read_csv(tmp_path / "rec" / "stops.csv")
+    table.loc[[1, 4, 8, 13, 16], "base_markers.x"] += 0.3
+    found = []
+    for order in (np.arange(len(table)), np.random.default_rng(3).permutation(len(table))):
+        table.iloc[order].to_csv(tmp_path / "rec" / "stops.csv", index=False)
+        suspects = check(tmp_path / "rec", graph=False).suspects
+        found.append({(s["kind"], s["name"], s["stop"]) for s in suspects})
+    assert found[0] == found[1] and len(found[0]) >= 5

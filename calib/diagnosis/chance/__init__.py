@@ -93,7 +93,7 @@ class Chance:
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
         p_serial: how often chance makes stops that follow each other err so much alike.
-        agreement: of most stops, where only some are off.
+        agreements: by recording or body, of most stops, where only some are off.
     """
 
     effect: Scatter
@@ -103,7 +103,12 @@ class Chance:
     detectable: float
     rivals: Sequence[str] = ()
     p_serial: float = 1.0
-    agreement: Agreement | None = None
+    agreements: Sequence[Agreement | None] = ()
+
+    @property
+    def agreed(self) -> bool:
+        """Whether nothing of it scatters, as everywhere only some stops are off."""
+        return bool(self.agreements) and all(self.agreements)
 
     @property
     def p_adjusted(self) -> float:
@@ -196,11 +201,7 @@ class Chance:
             told = [s.told for s in self.spreads if s.sd > s.sigma] or [self.spreads[0].told]
             told = " and ".join(told)
             what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
-        rivals = (
-            f"On these data it is not distinguishable from {', '.join(self.rivals)}. "
-            if self.rivals
-            else ""
-        )
+        rivals = f"On these data it is not distinguishable from {', '.join(self.rivals)}. "
         how = f"random as far as these data show (p = {self.p_adjusted:.1g})"
         if self.p_serial < ALPHA_SERIAL:
             how = (
@@ -209,7 +210,7 @@ class Chance:
                 "goes with the pose where poses follow a path"
             )
         return (
-            f"{what}; {how}. {rivals}"
+            f"{what}; {how}. {rivals if self.rivals else ''}"
             f"{name} widens every sigma by that; it predicts nothing at another {each}, so the "
             "held-out error does not fall."
         )

@@ -1,17 +1,21 @@
 """Whether most stops agree, and a few are off, where stops seem to scatter by chance.
 
-Were values drawn from one normal distribution, as scatter has it, then standardised ones (r,) would
-be independent, normal, and of variance 1. A ball of radius q, wherever it is, then holds any of
-them with a probability of that of chi-square, r, below q^2, or less (Anderson 1955). So of n values
-m or more lie in the ball about one of them that reaches to the m-th with the tail of a binomial, or
-less, times n. Half of the stops or more in a ball that is empty far around it are no chance: these
-agree, and something was wrong at the others.
+Were values (r,) drawn from one normal distribution, as scatter has it, a ball of radius q, wherever
+it is, would hold any of them no more often than one about their mean (Anderson 1955). With a mean
+square of r in all, that is most often where they lie along one direction: the probability of
+chi-square, 1, below q^2 / r, where that is below 1 (Szekely and Bakirov 2003, Probability Theory
+and Related Fields 126, have it for two directions; above 1 nothing is said). So the binomial tail
+of as many of n values in the ball about one of them that reaches to the m-th says how close they
+lie, least over balls of half of the values or more with an empty gap around them; and how often it
+is as little by chance is drawn, of values along one direction. What chance does not do so is
+nothing that scatters: most agree, and something was wrong at the others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,10 +30,16 @@ from calib.residuals.groups import Group
 from calib.solve.components.told import DIRECTION_SEEN, Told, told
 from calib.solve.estimate import Estimate
 
-ALPHA_AGREE = 1e-6  # the least p-value that is ever told
+# How often chance may make stops agree: a choice, as for other names that are easily checked.
+ALPHA_AGREE = 0.01
+# Up to so many stops it is drawn how often, from 2000 draws; of more the bound itself is enough.
+MOST_DRAWN_FOR, AGREE_BATCHES, DRAWN_AT_ONCE = 60, 8, 250
 FEWEST_AGREEING = 5  # stops; and of those off: a single one is a blunder for which others are asked
 FEWEST_OFF_TOGETHER = 2
 NO_SD = 1e-9  # m and rad: of what does not scatter; far below what anything tells
+# Of the most that is told of any member in some direction, less than which tells nothing of one:
+# rows that are thirty sigmas off weigh a thousandth, and still tell of theirs.
+SEEN_BY_ITSELF = 1e-6
 GAP_AROUND = 3.0  # times further off than those that agree is the nearest of the others: a choice
 MOST_CENTRES = 500  # about which balls are looked at, evenly chosen
 
@@ -45,6 +55,7 @@ class Agreement:
         what: in what they agree.
         lead: the unit in which the others stand out most.
         alike: whether they are all off by the same.
+        look: at what to look.
     """
 
     agree: int
@@ -53,6 +64,7 @@ class Agreement:
     what: str
     lead: str
     alike: bool
+    look: str
 
     def blunders(self) -> Iterator[dict[str, Any]]:
         """The others, as diagnosis.json has blunders."""
@@ -62,9 +74,9 @@ class Agreement:
             alike += ", and either half may be right" * (self.agree == len(self.off))
         for group, size in self.off:
             said = (
-                f"{group.where}: {_sizes(size)} off {self.what}; {self.agree} of "
-                f"{self.agree + len(self.off)} stops agree there within {_sizes(self.within)}, so "
-                f"that is no scatter by chance{alike}. Look at its scan and at its tracked bodies."
+                f"{group.where} is {_sizes(size)} off {self.what}, where {self.agree} of "
+                f"{self.agree + len(self.off)} stops agree to {_sizes(self.within)}: that is no "
+                f"scatter by chance{alike}. Look at {self.look}."
             )
             yield {
                 **otherwise(group.kind, group.what, group.where, said),
@@ -84,17 +96,17 @@ def _sizes(of: Mapping[str, float]) -> str:
     return " and ".join(f"{scale * size:.3g} {unit}" for size, (unit, scale) in pairs)
 
 
-def agreement(
+def agreements(
     effect: Scatter, estimate: Estimate, others: Others, blunders: Sequence[Blunder]
-) -> Agreement | None:
-    """What agrees of that which seems to scatter by chance, if most does; the effect is in the
-    model of a fit, of which these are all rows and all groups of them."""
-    found: Iterator[Agreement | None] = iter(())
+) -> list[Agreement | None]:
+    """What agrees of that which seems to scatter by chance, of each recording or body, None where
+    most does not; the effect is in the model of a fit, of which these are all rows and all groups
+    of them."""
     if effect.widens and effect.site is Site.TRACKER:
-        found = _of_bodies(blunders)
-    elif not effect.widens and effect.per == "stop":
-        found = _of_values(effect, estimate, others)
-    return next((each for each in found if each), None)
+        return [*_of_bodies(blunders)]
+    if not effect.widens and effect.per == "stop":
+        return [*_of_values(effect, estimate, others)]
+    return []
 
 
 def _of_values(effect: Scatter, estimate: Estimate, others: Others) -> Iterator[Agreement | None]:
@@ -109,12 +121,21 @@ def _of_values(effect: Scatter, estimate: Estimate, others: Others) -> Iterator[
             values, covariance = _by_themselves(rows, len(names))
             sd = np.maximum(unknown.sigma, NO_SD).reshape(len(names), size)
             wide = covariance + np.square(sd)[:, :, None] * np.eye(size)
-            seen = np.isfinite(wide).all(axis=(1, 2))
+            seen = _seen(rows, len(names))
             scans = (s.group for s in problem.scans if s.group.recording == label)
             who = {f"{term.effect.label}{group.where}": group for group in scans}
             known = [k for k in np.flatnonzero(seen).tolist() if names[k] in who]
             groups, units = [who[names[k]] for k in known], np.array(unknown.units[:size])
-            yield _split(values[known], wide[known], groups, units, effect.what)
+            look = "its scan" + " and its tracked bodies" * (size > 1)
+            yield _split(values[known], wide[known], groups, units, (effect.what, look))
+
+
+def _seen(rows: Told, count: int) -> np.ndarray:
+    """(K,) of which of so many members rows tell in every direction."""
+    size, each = len(rows.score) // count, np.arange(count)
+    blocks = rows.information.reshape(count, size, count, size)[each, :, each]
+    root = np.sqrt(np.maximum(np.einsum("kii->ki", blocks).max(axis=0), NO_SD))
+    return np.linalg.eigvalsh(blocks / np.outer(root, root))[:, 0] > SEEN_BY_ITSELF
 
 
 def _by_themselves(rows: Told, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +159,8 @@ def _of_bodies(blunders: Sequence[Blunder]) -> Iterator[Agreement | None]:
             np.stack([getattr(b.shift, of) for b in some]) for of in ("offset", "covariance")
         )
         units = np.array(some[0].shift.units)
-        yield _split(offset, covariance, [b.group for b in some], units, f"where {body} is")
+        told_of = (f"in where the tracker sees {body}", "its row")
+        yield _split(offset, covariance, [b.group for b in some], units, told_of)
 
 
 def _split(
@@ -146,11 +168,12 @@ def _split(
     covariance: np.ndarray,
     who: Sequence[Group],
     units: np.ndarray,
-    what: str,
+    said: tuple[str, str],
 ) -> Agreement | None:
     """Those of some values (K, r), of these covariances (K, r, r) if by chance, that agree, in all
-    or in those of one unit, and the others; None where that may be chance."""
-    every = dict.fromkeys(units.tolist())
+    or in those of one unit, and the others; None where that may be chance. It is `said` in what,
+    and at what to look."""
+    every, (what, look) = dict.fromkeys(units.tolist()), said
     looks = [np.full(len(units), True), *(units == unit for unit in every if len(every) > 1)]
     balls = [_ball(values[:, at], covariance[:, at][:, :, at]) for at in looks]
     p, agree = min(filter(None, balls), key=lambda ball: ball[0], default=(1.0, None))
@@ -176,26 +199,57 @@ def _split(
         what=what,
         lead=lead,
         alike=apart[lead] * GAP_AROUND < off[lead],
+        look=look,
     )
 
 
 def _ball(values: np.ndarray, covariance: np.ndarray) -> tuple[float, np.ndarray] | None:
     """How often chance makes as many of some values (K, r), of these covariances, lie together as
     do where that is least likely; and which these are. None where no gap is around them."""
-    count, size = values.shape
-    least, most = max(FEWEST_AGREEING, -(-count // 2)), count - FEWEST_OFF_TOGETHER
-    if most < least:
+    count = len(values)
+    numbers = count - FEWEST_OFF_TOGETHER + 1 - _half(count)
+    if numbers < 1:
         return None
     z = np.linalg.solve(np.linalg.cholesky(covariance), values[..., None])[..., 0]
-    z -= z.mean(axis=0)
-    z /= max(float(np.sqrt(np.square(z).mean())), NO_SD)  # by chance they are as wide as they are
-    centre = z[:: -(-count // MOST_CENTRES)]
-    far = np.linalg.norm(z[None] - centre[:, None], axis=2)
-    order = np.argsort(far, axis=1)
-    reach = np.take_along_axis(far, order, axis=1)
-    number = np.arange(least, most + 1)  # of those in a ball
-    inside = special.chdtr(size, np.square(reach[:, number - 1]))
-    p = count * len(number) * special.bdtrc(number - 2.0, count - 1, inside)
-    p[reach[:, number] < GAP_AROUND * reach[:, number - 1]] = np.inf
-    i, k = np.unravel_index(np.argmin(p), p.shape)
-    return (float(p[i, k]), order[i, : number[k]]) if p[i, k] < np.inf else None
+    tail, (order,), (number,) = _tails(z[None])
+    if tail[0] >= 1.0:
+        return None
+    p = count * numbers * float(tail[0])
+    if count <= MOST_DRAWN_FOR:
+        p = min(p, float(np.mean(np.append(_drawn_tails(count) <= tail[0], True))))
+    return p, order[:number]
+
+
+def _half(count: int) -> int:
+    return max(FEWEST_AGREEING, -(-count // 2))
+
+
+def _tails(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of some sets of values (D, K, r): the least tail (D,) of balls with a gap around them, 1
+    where there is none, the values (D, K) in the order of their distance from its centre, and how
+    many (D,) are in it."""
+    draws, count, size = z.shape
+    z = z - z.mean(axis=1, keepdims=True)
+    z /= np.maximum(np.sqrt(np.square(z).mean(axis=(1, 2), keepdims=True)), NO_SD)
+    centre = z[:, :: -(-count // MOST_CENTRES)]
+    far = np.linalg.norm(z[:, None] - centre[:, :, None], axis=3)
+    order = np.argsort(far, axis=2)
+    reach = np.take_along_axis(far, order, axis=2)
+    number = np.arange(_half(count), count - FEWEST_OFF_TOGETHER + 1)  # of those in a ball
+    share = np.square(reach[..., number - 1]) / size
+    inside = np.where(share < 1.0, special.chdtr(1, share), 1.0)
+    tail = special.bdtrc(number - 2.0, count - 1, inside)
+    tail[reach[..., number] < GAP_AROUND * reach[..., number - 1]] = 1.0
+    flat = tail.reshape(draws, -1)
+    i, m = np.unravel_index(flat.argmin(axis=1), tail.shape[1:])
+    each = np.arange(draws)
+    return flat.min(axis=1), order[each, i], number[m]
+
+
+@cache
+def _drawn_tails(count: int) -> np.ndarray:
+    """Such tails of so many values along one direction, by chance."""
+    rng = np.random.default_rng(0)
+    return np.concatenate(
+        [_tails(rng.standard_normal((DRAWN_AT_ONCE, count, 1)))[0] for _ in range(AGREE_BATCHES)]
+    )

@@ -61,7 +61,7 @@ class Search:
         beside: the last look, where blunders were judged beside formulas; see `beside_formulas`.
         scatter_judged: whether what scatters by chance was judged there, too.
         sways: the base, if its moves explain what seems to scatter.
-        more: whether as many effects are named as are at once, and another is confirmed.
+        more: whether as many are named as are at once, and another is confirmed.
     """
 
     looks: Sequence[Look]
@@ -119,9 +119,9 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         plain = _steps(stand, progress, most, begun=plain)
         steps = plain if _explain_all(plain, progress) else steps
     looks, found, left = steps
+    named = [step.effect.family for step in found]
     more = bool(found) and len(found) == most and anything(looks[-1], progress)
-    chance: list[Chance] = []
-    unsettled: Chance | None = None
+    chance, unsettled = list[Chance](), None
     while most and (strongest := next((c for c in looks[-1].chance if c.found), None)):
         others = [c for c in looks[-1].chance if c.found and c is not strongest]
         as_much = outdoing(looks[-1], strongest.statistic)
@@ -154,7 +154,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
         scatter=scattering(last, progress) if most else None,
         chance=last.still(chance),
         unsettled=unsettled,
-        more=more and len(found) == most,
+        more=more and [step.effect.family for step in found] == named,
     )
     by_chance = [*done.chance, *([done.unsettled] if done.unsettled else [])]
     done = replace(done, sways=sways(done.looks[-1].stand, by_chance, progress))
@@ -168,8 +168,8 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
 def _alike(strongest: Chance, others: Sequence[Chance], beside: Look) -> list[Effect]:
     """Others that scatter by chance as much as the strongest, or that nothing is left of once it is
     in the model, as a look beside it has them."""
-    tested = {c.effect.name for c in beside.chance}
-    near = [c.effect for c in others if strongest.statistic - c.statistic < 2 * ODDS]
+    tested, least = {c.effect.name for c in beside.chance}, strongest.statistic - 2 * ODDS
+    near = [c.effect for c in others if c.statistic > least]
     return [*near, *(c.effect for c in others if c.effect.name not in tested)]
 
 
@@ -186,7 +186,9 @@ def _outlasting(
         return look, found
     steps: list[NamedEffect] = []
     for step in kept:
-        there = [e.name for e in step.after.stand.model.effects if e.family in families]
+        stays = {each.effect.name for each in kept}  # of others there may be earlier shapes
+        every = (e for e in step.after.stand.model.effects if e.family in families)
+        there = [e.name for e in every if e.name not in stays]
         bare = tried(step.after.stand.lacking, there, progress) if there else None
         steps.append(replace(step, after=bare.look(progress)) if bare else step)
     return less.look(progress), steps

@@ -84,7 +84,8 @@ def _better_shapes(stand: Stand, names: Collection[str], progress: Progress) -> 
         further = [_further(stand, step, test) for step, test in tests if test.dof]
         gain, shape = max(further, default=(0.0, effect.shape))
         better = effect.at(shape)
-        if gain > BETTER_SHAPE and better.name not in (name, *(e.name for e in swapped.values())):
+        taken = {*stand.model.names, *(e.name for e in swapped.values())}
+        if gain > BETTER_SHAPE and better.name not in taken:
             swapped[name] = better
     return swapped
 

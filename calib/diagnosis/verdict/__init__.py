@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from calib.blunders import told
@@ -29,7 +30,14 @@ from calib.diagnosis.verdict.matters import (
     weighed,
 )
 from calib.diagnosis.verdict.names import absorbed, believed, beside_scatter, dressed_up
-from calib.diagnosis.verdict.sentences import BAD, UNNAMED, sentences_of, stops_of, unconfirmed
+from calib.diagnosis.verdict.sentences import (
+    BAD,
+    UNNAMED,
+    scatters,
+    sentences_of,
+    stops_of,
+    unconfirmed,
+)
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.residuals.groups import Group
 from calib.results.errors import judged_mm
@@ -166,7 +174,7 @@ def conclude(
     """
     heavy = weighed(found, held_out, judged_mm(summary))
     found, first = heavy.found, found.looks[0]
-    blunders = _blunders(found, rejected, plain)
+    blunders = _blunders(found, rejected, plain, bool(formulas.formulas))
     hold = believed(found, held_out) and not formulas.instead
     more = formulas.formulas or found.unsettled or (heavy.refused and found.at_first)
     more = bool(more or (rejected and not rejected.explained))
@@ -200,7 +208,7 @@ def conclude(
         curves=curves(first.unnamed),
         too_few=stops_of(first) < FEWEST_STOPS,
         rejected=rejected,
-        scatter=[s.document(each.effect.name) for each in found.chance for s in each.spreads],
+        scatter=[s.document(c.effect.name) for c in scatters(found.chance) for s in c.spreads],
     )
 
 
@@ -212,12 +220,19 @@ def _deferred(found: Search, verdict: str, unknown: bool, formulas: Unnamed) -> 
 
 
 def _blunders(
-    found: Search, rejected: Rejects | None, plain: Sequence[Mapping[str, Any]]
+    found: Search,
+    rejected: Rejects | None,
+    plain: Sequence[Mapping[str, Any]],
+    described: bool,
 ) -> list[Mapping[str, Any]]:
-    """All that is wrong in the recordings; arguments as of `conclude`."""
+    """All that is wrong in the recordings; arguments as of `conclude`. What some stops are off by
+    is judged once nothing else is missing, structure that formulas have `described` included."""
     sources = found.looks[0].stand.sources
     thrown = rejected.blunders(sources, alone=not found.found) if rejected else ()
-    off = [each for c in found.chance if c.agreement for each in c.agreement.blunders()]
+    sways = found.sways.names if found.sways else ()
+    judged = not (found.more or found.unnamed or described)
+    some = [c.agreements for c in found.chance if judged and c.effect.name not in sways]
+    off = [each for agreed in chain(*some) if agreed for each in agreed.blunders()]
     # Stops that are off by the same move a frame between what they say and what others do.
     left = (each for each in found.blunders if not (off and each.blunder.group.kind == "frame"))
     return [*plain, *thrown, *(told.document(each, sources) for each in left), *off]

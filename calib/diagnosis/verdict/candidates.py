@@ -51,7 +51,7 @@ def candidate_documents(
         each["matters"] = told_of.document() if told_of else None
         each["dressed_up"] = bool(each["step"]) and each["add"] in worn
     # Residual structure may be random scatter: that is judged once it is in the model.
-    no_step = [deferred or bool(each.agreement) for each in found.chance]
+    no_step = [deferred or each.agreed for each in found.chance]
     chance = [
         each.document(None if no else named + i)
         for i, (each, no) in enumerate(zip(found.chance, no_step, strict=True), 1)

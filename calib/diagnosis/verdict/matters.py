@@ -231,7 +231,9 @@ def weighed(
                 traces.append(_sentence(f"structure over {what}", candidate, look.unnamed, told))
     if not refused and not named:
         kept["at_first"] = []  # nothing stands in the way of what is left
-    return Weighed(replace(found, found=named, **kept), matter, traces, refused=refused)
+    more = found.more and len(named) == len(found.found)
+    found = replace(found, found=named, more=more, **kept)
+    return Weighed(found, matter, traces, refused=refused)
 
 
 def as_good(errors: Errors, than_mm: float, thrown: float) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.chance import Chance
 from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search import NamedEffect, Search
@@ -91,10 +92,15 @@ def sentences_of(
     return out
 
 
+def scatters(some: Sequence[Chance]) -> list[Chance]:
+    """Those of which something scatters, and that are not a few stops that are off."""
+    return [chance for chance in some if not chance.agreed]
+
+
 def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
     """What is said of scatter by chance, and of a base that sways in place of some of it."""
     if found.sways:
-        rest = (c for c in found.chance if c.effect.name not in found.sways.names)
+        rest = (c for c in scatters(found.chance) if c.effect.name not in found.sways.names)
         return [found.sways.sentence, *(each.sentence for each in rest)]
     beside = ", ".join(each.effect.name for each in found.chance)
     if deferred and found.more:
@@ -102,7 +108,7 @@ def _scatter_sentences(found: Search, deferred: bool) -> list[str]:
         return [f"More effects are missing beside these: add them, and diagnose again{scatter}."]
     if deferred and beside:
         return [f"Random scatter ({beside}) is judged once that structure is in the model."]
-    return [each.sentence for each in found.chance if not each.agreement]
+    return [each.sentence for each in scatters(found.chance)]
 
 
 def unconfirmed(candidate: Candidate | None, over: float) -> str:

@@ -107,8 +107,8 @@ def _tied(source: Source) -> bool:
 
 
 def _is_better(turned: np.ndarray, as_is: np.ndarray) -> bool:
-    """Whether scans (K,) fit turned, some of them notably better than as they are, and none
-    notably worse."""
+    """Whether scans (K,) fit turned, some of them notably better than as they are, and what others
+    lose is next to nothing of what these gain."""
     by = as_is - turned
     better, worse = by.clip(min=0.0).sum(), -by.clip(max=0.0).sum()
     enough = np.count_nonzero(by > NOTABLY) >= FEWEST_BETTER and by.mean() > FITS_ALIKE
