@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.problem.problem import Problem
-from calib.solve.otherwise.orientations import best_turn, lidars_turned, sampled
+from calib.solve.otherwise.orientations import best_turn, by_turning_frame, lidars_turned
 from calib.solve.otherwise.sampled import FITS_M, NEAR_M, NEARER, asked, turned_off_m
 
 MIRROR = np.diag([1.0, -1.0, 1.0])  # any other follows by turns
@@ -44,7 +44,7 @@ def axes_of(
     turned = lidars_turned(problem, values) if turned is None else turned
     quarters = Rotation.create_group("O").as_matrix().round()
     every = np.concatenate([quarters, quarters @ MIRROR])
-    for (name, _), scans in sampled(problem, values).items():
+    for (name, _), scans in by_turning_frame(problem, values).items():
         chosen, frame = asked(scans), scans[0].scan.stops.rig.lidar_frame
         start_m = turned_off_m(chosen, np.eye(3)[None])[0]
         if start_m < NEAR_M or name in turned:

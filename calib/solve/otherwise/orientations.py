@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from calib.problem.problem import Problem
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import MeshSurface
-from calib.solve.otherwise.sampled import NEAR_M, NEARER, Sampled, asked, turned_off_m
+from calib.solve.otherwise.sampled import NEAR_M, NEARER, Sampled, Values, asked, turned_off_m
 from chains import se3
 
 # Orientations of a LiDAR are looked at on a grid, of turns by up to 0.6 rad about three axes beside
@@ -18,10 +18,8 @@ from chains import se3
 # 0.3 rad away passes over the scans find the optimum.
 STEP_RAD, FINER_RAD, BEST = 0.3, (0.15, 0.07), 8
 
-Values = dict[str, np.ndarray]
 
-
-def lidars_turned(problem: Problem, values: Mapping[str, np.ndarray]) -> Values:
+def lidars_turned(problem: Problem, values: Values) -> dict[str, np.ndarray]:
     """The frame of each LiDAR turned as its scans fit the mesh best, of orientations all around.
 
     Args:
@@ -34,14 +32,12 @@ def lidars_turned(problem: Problem, values: Mapping[str, np.ndarray]) -> Values:
     """
     return {
         name: _with_turn(values[name], start, turn)
-        for (name, start), scans in sampled(problem, values).items()
+        for (name, start), scans in by_turning_frame(problem, values).items()
         if (turn := best_turn(scans)) is not None
     }
 
 
-def sampled(
-    problem: Problem, values: Mapping[str, np.ndarray]
-) -> dict[tuple[str, int], list[Sampled]]:
+def by_turning_frame(problem: Problem, values: Values) -> dict[tuple[str, int], list[Sampled]]:
     """The scans of each LiDAR that a mesh shows, by the unknown that turns its frame."""
     seen: dict[tuple[str, int], list[Sampled]] = {}
     for scan in problem.scans:

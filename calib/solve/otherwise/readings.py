@@ -22,7 +22,7 @@ from calib.solve.otherwise.sampled import (
     Sampled,
     Values,
     asked,
-    sampled_by_lidar,
+    sampled_by_recording,
     turned_off_m,
 )
 from chains import se3
@@ -148,11 +148,10 @@ def readings_of(problem: Problem, values: Values, turned: Values) -> Iterator[Su
             where targets say so. Where a guess does, it is what each reading makes of it.
         turned: the frames of LiDARs that would have to turn, as of `lidars_turned`.
     """
-    done: set[int] = set()
-    for (number, _), scans in sampled_by_lidar(problem, {**values, **turned}).items():
+    for number, scans in sampled_by_recording(problem, {**values, **turned}).items():
         source = problem.sources[number]
         body = _only_body(source)
-        if body is None or number in done:
+        if body is None:
             continue
         seen = np.isfinite(source.recording.bodies[body]).all(axis=1)
         told = [each for each in scans if seen[each.scan.index]]
@@ -164,7 +163,6 @@ def readings_of(problem: Problem, values: Values, turned: Values) -> Iterator[Su
             continue
         found = _fitting(source, body, chosen, values, as_is_m)
         if found is not None:
-            done.add(number)
             yield found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from calib.problem.model import Source
 from calib.problem.problem import Problem
 from calib.residuals.surfaces import MeshSurface
-from calib.solve.otherwise.sampled import Sampled, Values, sampled_by_lidar
+from calib.solve.otherwise.sampled import Sampled, Values, sampled_by_recording
 from chains import se3
 from sensors.lidar import Beams
 
@@ -88,7 +88,7 @@ def rooms_turned(problem: Problem, values: Values) -> Iterator[TurnedRoom]:
             over.
         values: the state from which scans are laid on the mesh.
     """
-    for (number, _), scans in sampled_by_lidar(problem, values).items():
+    for number, scans in sampled_by_recording(problem, values).items():
         source = problem.sources[number]
         if source.recording.base_guess is None or _tied(source):
             continue

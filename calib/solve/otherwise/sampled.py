@@ -91,14 +91,12 @@ def turned_off_m(scans: Sequence[Sampled], turns: np.ndarray) -> np.ndarray:
     return np.mean([each.off_m(each.turned(turns)) for each in scans], axis=0)
 
 
-def sampled_by_lidar(
-    problem: Problem, values: Mapping[str, np.ndarray]
-) -> dict[tuple[int, str], list[Sampled]]:
-    """The scans that a mesh shows, by the number of their recording and the frame of its LiDAR."""
+def sampled_by_recording(problem: Problem, values: Values) -> dict[int, list[Sampled]]:
+    """The scans that a mesh shows, by the number of their recording."""
     number = {id(source.recording): i for i, source in enumerate(problem.sources)}
-    found: dict[tuple[int, str], list[Sampled]] = {}
+    found: dict[int, list[Sampled]] = {}
     for scan in problem.scans:
         if isinstance(scan.meeting, MeshSurface):
-            key = number[id(scan.recording)], scan.stops.rig.lidar_frame
-            found.setdefault(key, []).append(Sampled(scan, scan.pose(values)))
+            mine = found.setdefault(number[id(scan.recording)], [])
+            mine.append(Sampled(scan, scan.pose(values)))
     return found
