@@ -26,6 +26,9 @@ MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held ag
 # How far the root went between two stops, rad and m alike: fits end with 0.02 m, and name it; with
 # 0.05 m they did not end. How many times further than from stop to stop elsewhere: a choice.
 PUSHED, CLEARLY = 0.02, 5.0
+STOPS_BESIDE = (
+    10  # stops on either side, by which it is known how far the root goes from stop to stop
+)
 
 
 @dataclass(frozen=True)
@@ -205,6 +208,9 @@ def _pushes(pairs: Sequence[SeenPair], rank: Array) -> list[Push]:
     far = size_of(moved) >= np.maximum(PUSHED, CLEARLY * usual)
     found = []
     for k, by in zip(at[far].tolist(), moved[far], strict=True):
+        beside = step[max(k - 1 - STOPS_BESIDE, 0) : k - 1], step[k : k + STOPS_BESIDE]
+        if size_of(by) < CLEARLY * max(map(np.median, beside)):
+            continue  # from then on it is elsewhere at every stop
         before, after = (int(lead.stops[i]) for i in (k - 1, k))
         said = {
             pair.names[0]: _borne_out(by, twist, int(np.sum(rank[pair.stops] < rank[after])))
