@@ -110,3 +110,12 @@ def test_a_body_that_is_seen_turned_at_some_stops_is_no_scatter(tmp_path, which)
     assert ("either half may be right" in found.blunders[0]["sentence"]) == half
     sizes = [b["size"] for b in found.blunders if b["unit"] == "rad"]
     assert sizes == pytest.approx([np.radians(1.0)] * len(which), rel=0.1)
+
+
+def test_a_covariance_that_rounding_has_spoiled_is_no_fault():
+    """Of bodies that other rows hardly check it may have a direction of less than nothing."""
+    rng = np.random.default_rng(5)
+    C = np.eye(6)
+    C[0, 1] = C[1, 0] = 1.0 + 1e-12
+    assert np.linalg.eigvalsh(C)[0] < 0.0
+    assert split(rng.normal(size=(12, 6)) @ np.diag([1, 0, 1, 1, 1, 1]), C) is None

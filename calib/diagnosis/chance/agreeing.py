@@ -36,6 +36,7 @@ ALPHA_AGREE = 0.01
 MOST_DRAWN_FOR, AGREE_BATCHES, DRAWN_AT_ONCE = 60, 8, 250
 FEWEST_AGREEING = 5  # stops; and of those off: a single one is a blunder for which others are asked
 FEWEST_OFF_TOGETHER = 2
+LEAST_VARIANCE = 1e-6  # of a direction, of that of each number: below it is rounding
 NO_SD = 1e-9  # m and rad: of what does not scatter; far below what anything tells
 # Of the most that is told of any member in some direction, less than which tells nothing of one:
 # rows that are thirty sigmas off weigh a thousandth, and still tell of theirs.
@@ -210,7 +211,11 @@ def _ball(values: np.ndarray, covariance: np.ndarray) -> tuple[float, np.ndarray
     numbers = count - FEWEST_OFF_TOGETHER + 1 - _half(count)
     if numbers < 1:
         return None
-    z = np.linalg.solve(np.linalg.cholesky(covariance), values[..., None])[..., 0]
+    # In units of their sizes; m and rad in one matrix, or what rounding leaves, may have no root.
+    size = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), NO_SD**2))
+    variance, axes = np.linalg.eigh(covariance / (size[:, :, None] * size[:, None]))
+    along = np.vecmat(values / size, axes) / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
+    z = np.matvec(axes, along)  # the axes of one are not those of another
     tail, (order,), (number,) = _tails(z[None])
     if tail[0] >= 1.0:
         return None
