@@ -72,6 +72,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import special
@@ -138,13 +139,18 @@ def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpr
         stops: how many stops have a share in it; one tells nothing.
         spent: how many unknowns of the model differ by stop alone.
     """
-    by_stop, *others = (_evenly(shares) for shares in ways)
+    return spread_by([ShareSquares.of(shares) for shares in ways], stops, spent)
+
+
+def spread_by(ways: Sequence[ShareSquares], stops: int, spent: int = 0) -> ScoreSpread:
+    """The same from sums of the shares by each way."""
+    by_stop, *others = (squares.covariance() for squares in ways)
     more = _beyond(*others) if others else np.zeros_like(by_stop)
-    count = max(min([stops, *map(len, ways[1:2])]), 1)
-    nu = _freedom(ways[0], count)
+    count = max(min([stops, *(squares.count for squares in ways[1:2])]), 1)
+    nu = ways[0].freedom(count)
     if np.trace(more) > 0.0:
-        nu = min(nu, _freedom(ways[1], len(ways[1])))
-    size = np.square(ways[0]).sum(axis=1)
+        nu = min(nu, ways[1].freedom(ways[1].count))
+    size = ways[0].each
     # Were scores normal, their squares would scatter by 2 / nu.
     even = size.sum() ** 2 / max(np.square(size).sum(), 1e-300) * (1.0 + 2.0 / nu)
     left = max(count - 1.0 - spent, 0.0)
@@ -158,21 +164,52 @@ def _widened(count: int, spent: int) -> float:
     return (count - 1.0) / max(count - 1.0 - spent, 1.0) if spent else 1.0
 
 
-def _freedom(shares: np.ndarray, count: int) -> float:
-    """Degrees of freedom of the square of a sum of shares (c, r), by pairs of different clusters;
-    so many of them tell it."""
-    size = np.square(shares).sum(axis=1)
-    pairs = np.square(shares.T @ shares).sum() - np.square(size).sum()
-    alike = max(float(pairs / max(size.sum() ** 2, 1e-300)), 1e-9)
-    return max((1.0 - 1.0 / count) / alike - 2.0 / count, 0.5)
+class ShareSquares(NamedTuple):
+    """What chance is told from of shares (c, r) of a score.
+
+    Args:
+        sum: (r,) of them.
+        each: (c,) the sum of squares of each.
+        products: (r, r) of all of them.
+    """
+
+    sum: np.ndarray
+    each: np.ndarray
+    products: np.ndarray
+
+    @classmethod
+    def of(cls, shares: np.ndarray) -> Self:
+        return cls(shares.sum(axis=0), squares_of(shares), shares.T @ shares)
+
+    @classmethod
+    def each_of(cls, shares: np.ndarray, ends: Sequence[int]) -> list[Self]:
+        """Of consecutive columns of shares (c, R), which end there (n,)."""
+        total, products = shares.sum(axis=0), shares.T @ shares
+        parts = [slice(*pair) for pair in pairwise([0, *ends])]
+        return [cls(total[at], squares_of(shares[:, at]), products[at, at]) for at in parts]
+
+    @property
+    def count(self) -> int:
+        return len(self.each)
+
+    def freedom(self, count: int) -> float:
+        """Degrees of freedom of the square of the sum, by pairs of different clusters; so many of
+        them tell it."""
+        pairs = np.square(self.products).sum() - np.square(self.each).sum()
+        alike = max(float(pairs / max(self.each.sum() ** 2, 1e-300)), 1e-9)
+        return max((1.0 - 1.0 / count) / alike - 2.0 / count, 0.5)
+
+    def covariance(self) -> np.ndarray:
+        """Covariance (r, r) of the sum, an even part of it taken off each."""
+        n = self.count
+        if n < 2:
+            return UNKNOWN_VARIANCE * np.eye(len(self.sum))
+        return (self.products - np.outer(self.sum, self.sum) / n) * n / (n - 1)
 
 
-def _evenly(shares: np.ndarray) -> np.ndarray:
-    """Covariance (r, r) of the sum of shares (c, r), an even part of it taken off each."""
-    count, total = len(shares), shares.sum(axis=0)
-    if count < 2:
-        return UNKNOWN_VARIANCE * np.eye(len(total))
-    return (shares.T @ shares - np.outer(total, total) / count) * count / (count - 1)
+def squares_of(rows: np.ndarray) -> np.ndarray:
+    """The sum of squares (c,) of each row (c, r)."""
+    return np.einsum("ij,ij->i", rows, rows)
 
 
 def _beyond(by_place: np.ndarray, both: np.ndarray) -> np.ndarray:

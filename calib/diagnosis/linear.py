@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from calib.diagnosis.leverage import Leverage
-from calib.linear.assembly import add_alone
+from calib.linear.assembly import alone
 from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.elimination import square
 from calib.linear.layout import Layout, positions
@@ -23,6 +23,7 @@ from calib.linear.own import OwnRows, own_rows
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
+from calib.residuals.compiled import add_at
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -219,9 +220,12 @@ def _add_others(
             alike.setdefault(rows.columns.tobytes(), []).append(rows)
     for some in alike.values():
         columns = some[0].columns
-        A = np.vstack([rows.A for rows in some]) * layout.sigma[columns]
-        information[np.ix_(at[columns], at[columns])] += square(A)
-        add_alone(raw, layout, A, columns)
+        A = np.vstack([rows.A for rows in some]) if len(some) > 1 else some[0].A
+        unit = layout.sigma[columns]
+        found = square(A) * unit * unit[:, None]
+        add_at(information, at[columns], at[columns], found)
+        for name, mine, its in alone(layout, columns):
+            raw[name][np.ix_(its, its)] += found[mine, mine]
 
 
 def _in_own_units(layout: Layout, information: np.ndarray, raw: Mapping[str, np.ndarray]) -> None:

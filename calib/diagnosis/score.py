@@ -14,10 +14,10 @@ from functools import cached_property
 
 import numpy as np
 from scipy import special
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from calib.blunders.chance import at_least, enough, log_tail
-from calib.diagnosis.jackknife import ScoreSpread, by_signs
+from calib.diagnosis.jackknife import ScoreSpread, ShareSquares, spread_by
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import NONE, Linear
 from calib.linear.clusters import summed
@@ -99,15 +99,20 @@ class Scores:
         """Shares of some columns (n, q) by stop and, where any place is met from several stops, by
         place, and by both, of those that have any share of any; each adds up to the score, as rows
         that have no stop, or no place, are clusters of their own."""
-        return [part[np.ix_(rows, columns)] for part, rows in self._ways]
+        return [part[:, columns] for part in self._ways]
 
     @cached_property
-    def _ways(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Their shares (n, Q) by these ways, and which of them have any."""
+    def _ways(self) -> list[np.ndarray]:
+        """The same of all columns, (n, Q) each."""
         every = [np.vstack([self.by_stop, self.cells[self.stop < 0]])]
         if np.bincount(self.place[self.place >= 0]).max(initial=0) > 1:
             every += [np.vstack([self.by_place, self.cells[self.place < 0]]), self.cells]
-        return [(part, np.flatnonzero(np.any(part, axis=1))) for part in every]
+        return [part[np.any(part, axis=1)] for part in every]
+
+    @cached_property
+    def sharing(self) -> int:
+        """How many stops have any share of any score, which come first by stop."""
+        return int(np.any(self.by_stop, axis=1).sum())
 
     @cached_property
     def draws(self) -> np.ndarray:
@@ -302,14 +307,26 @@ def explained(scores: Scores, columns: np.ndarray) -> tuple[np.ndarray, float]:
 
 def score_test(scores: Scores, columns: np.ndarray) -> ScoreTest:
     """Test the candidate of these columns."""
-    whiten, statistic = explained(scores, columns)
-    clusters = int((np.abs(scores.by_stop[:, columns] @ whiten).max(axis=1, initial=0.0) > 0).sum())
-    return ScoreTest(
-        columns=columns,
-        statistic=statistic,
-        whiten=whiten,
-        chances=(by_signs([way @ whiten for way in scores.ways(columns)], clusters, scores.spent),),
-        clusters=clusters,
-        score=scores.score[columns],
-        spent=scores.spent,
-    )
+    return score_tests(scores, [columns])[0]
+
+
+def score_tests(scores: Scores, sets: Sequence[np.ndarray]) -> list[ScoreTest]:
+    """Test candidates, each of some columns (q,), together: so the products are few and large."""
+    every = [explained(scores, columns) for columns in sets]
+    whiten = block_diag(*(each for each, _ in every))
+    ends = np.cumsum([each.shape[1] for each, _ in every]).tolist()
+    shares = [way @ whiten for way in scores.ways(np.concatenate(sets))]
+    squares = [ShareSquares.each_of(way, ends) for way in shares]
+    return [
+        ScoreTest(
+            columns=columns,
+            statistic=statistic,
+            whiten=each,
+            chances=(spread_by(ways, clusters, scores.spent),),
+            clusters=clusters,
+            score=scores.score[columns],
+            spent=scores.spent,
+        )
+        for columns, (each, statistic), *ways in zip(sets, every, *squares, strict=True)
+        for clusters in [int(np.count_nonzero(ways[0].each[: scores.sharing]))]
+    ]

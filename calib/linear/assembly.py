@@ -6,8 +6,9 @@ grows with the number of stops, and most of the work is in products of large mat
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -285,7 +286,9 @@ class Assembly:
             rows, told = self._stacked(some, at, len(mine))
             over, shared = mine[len(self._own(some[0])) :], rows[:, :, len(self._own(some[0])) :]
             if self.raw is not None:
-                add_alone(self.raw, self.layout, shared[:, :told, :-1], over[:-1])
+                for name, some_of_it, its in alone(self.layout, over[:-1]):
+                    A = shared[:, :told, some_of_it].reshape(-1, len(its))
+                    self.raw[name][np.ix_(its, its)] += A.T @ A
             if count := len(mine) - len(over):
                 Q, R = np.linalg.qr(rows[:, :, :count], mode="complete")
                 inverse = np.linalg.inv(R[:, :count])
@@ -338,18 +341,14 @@ class Assembly:
         return out, sum(rows.of_each for rows, _ in parts if rows.measured)
 
 
-def add_alone(
-    raw: Mapping[str, np.ndarray], layout: Layout, rows: np.ndarray, columns: np.ndarray
-) -> None:
-    """Add to products of kept unknowns, of each by itself, those of rows (..., n) over columns
-    (n,); those of one unknown stand side by side, and each once."""
+def alone(layout: Layout, columns: np.ndarray) -> Iterator[tuple[str, slice, np.ndarray]]:
+    """Each unknown that columns (n,) are of, with where its own, side by side, stand among these
+    and among its own (k,)."""
     names, first = list(layout.at), np.array([at.start for at in layout.at.values()])
     of = np.searchsorted(first, columns, side="right") - 1
-    each = np.split(np.arange(len(columns)), np.flatnonzero(np.diff(of)) + 1)
-    for some in each if len(columns) else ():
-        mine = rows[..., some[0] : some[-1] + 1].reshape(-1, len(some))
-        which, at = of[some[0]], columns[some]
-        raw[names[which]][np.ix_(at - first[which], at - first[which])] += mine.T @ mine
+    ends = [0, *(np.flatnonzero(np.diff(of)) + 1).tolist(), len(columns)]
+    for start, end in pairwise(ends if len(columns) else ()):
+        yield names[of[start]], slice(start, end), columns[start:end] - first[of[start]]
 
 
 class _Waiting(NamedTuple):

@@ -222,15 +222,15 @@ class Graph:
     ) -> Iterator[tuple[Block | None, dict[str, np.ndarray], np.ndarray]]:
         """Block (none for a prior), whitened derivative by each variable (m, n), and right side
         (m,), minus the residual, of everything in the graph."""
-        linear = self._graph.linearize(self._to_gtsam(values))
-        names = list(self.variables)
-        priors = linear.size() - len(self.blocks)
-        for i in range(linear.size()):
-            A, b = linear.at(i).jacobian()
-            keys = [names[key] for key in list(linear.at(i).keys())]
-            ends = np.cumsum([self.variables[name].dim for name in keys])
-            by = dict(zip(keys, np.split(A, ends[:-1], axis=1), strict=True))
-            yield (self.blocks[i - priors] if i >= priors else None), by, b
+        now, names = self._to_gtsam(values), list(self.variables)
+        for i in range(self._graph.size() - len(self.blocks)):
+            prior = self._graph.at(i).linearize(now)
+            A, b = prior.jacobian()
+            yield None, {names[prior.keys()[0]]: A}, b
+        # As GTSAM calls them, but without its copies: a look's rows have thousands of columns.
+        for block in self.blocks:
+            residual, derivatives = self._evaluated(block, now, True)
+            yield block, derivatives, -residual
 
     def _ordering(self, last: Sequence[str] = ()) -> gtsam.Ordering:
         ordering = gtsam.Ordering()
@@ -257,26 +257,31 @@ class Graph:
         return gtsam.CustomFactor(noise, keys, self._callback(block))
 
     def _callback(self, block: Block) -> Callable:
-        variables = [self.variables[name] for name in block.variables]
-        keys = [self._key[name] for name in block.variables]
-
         def rows(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
-            now = {v.name: _read(v.kind, values, k) for v, k in zip(variables, keys, strict=True)}
-            residual, derivative = block.evaluate(now, jacobians is not None)
-            _check_finite(block, residual, "residual")
-            if jacobians is not None:
-                for i, v in enumerate(variables):
-                    d = derivative[v.name]
-                    if d.shape != (block.rows, v.dim):
-                        raise ValueError(
-                            f"block '{block.name}': derivative by '{v.name}' has shape {d.shape}, "
-                            f"not {(block.rows, v.dim)}"
-                        )
-                    _check_finite(block, d, f"derivative by '{v.name}'")
-                    jacobians[i] = np.asfortranarray(d)
+            residual, derivatives = self._evaluated(block, values, jacobians is not None)
+            for i, name in enumerate(block.variables if jacobians is not None else ()):
+                jacobians[i] = np.asfortranarray(derivatives[name])
             return residual
 
         return rows
+
+    def _evaluated(
+        self, block: Block, values: gtsam.Values, derivatives: bool
+    ) -> tuple[np.ndarray, Derivatives]:
+        """A block's rows (m,) and, if wanted, their derivatives (m, n) by each of its variables, in
+        its order."""
+        variables = [self.variables[name] for name in block.variables]
+        now = {v.name: _read(v.kind, values, self._key[v.name]) for v in variables}
+        residual, by = block.evaluate(now, derivatives)
+        _check_finite(block, residual, "residual")
+        for v in variables if derivatives else ():
+            if by[v.name].shape != (block.rows, v.dim):
+                raise ValueError(
+                    f"block '{block.name}': derivative by '{v.name}' has shape "
+                    f"{by[v.name].shape}, not {(block.rows, v.dim)}"
+                )
+            _check_finite(block, by[v.name], f"derivative by '{v.name}'")
+        return residual, {v.name: by[v.name] for v in variables} if derivatives else {}
 
     def _to_gtsam(self, values: Values) -> gtsam.Values:
         out = gtsam.Values()

@@ -18,7 +18,8 @@ import numpy as np
 from calib.blunders.chance import log_tail
 from calib.diagnosis.formulas.factors import product_of
 from calib.diagnosis.formulas.table import BeamTable, Projection, together
-from calib.diagnosis.score import ScoreTest, score_test
+from calib.diagnosis.jackknife import squares_of
+from calib.diagnosis.score import ScoreTest, score_tests
 from calib.diagnosis.screen import by_rank, looked
 
 # Knots of a function of one covariate, of each of two and of three. A pair of 5 x 5 sees what turns
@@ -232,11 +233,10 @@ def _tested(
         shares = np.vstack([scores.by_stop, scores.by_place]).astype(signs.dtype)
         drawn = signs @ shares
         ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
-        for at in (np.arange(*pair) for pair in pairwise(ends)):
+        for found in score_tests(scores, [np.arange(*pair) for pair in pairwise(ends)]):
             progress(number, len(sets))
-            found = score_test(scores, at)
             if found.dof:
-                by_chance = np.sum(np.square(drawn[:, at] @ found.whiten), axis=1)
+                by_chance = squares_of(drawn[:, found.columns] @ found.whiten)
                 yield sets[number], (found, by_rank(by_chance))
             number += 1
 
