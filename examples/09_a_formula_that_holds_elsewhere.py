@@ -13,10 +13,11 @@ estimated anew. Those of all three terms agree, both ways; the error of held-out
 0.24 mm in A and to 0.30 mm in D with either. So the arm errs in these places, not one set of poses.
 What in the joint does so is not known: its encoder, its gear or the tension of its cables.
 
-`explain` does all of this without help. From series A it takes 0.45 mm to 0.18 mm, by the gear, by
-gravity, and by formulas over lift and pan. The arm that this describes, with only base and tool
-free, predicts series D to 0.28 mm; geometry that is fitted to D itself leaves 0.40 mm there. A
-last formula, over wrist 3, turns the tool. Orientations err less in A with it, and more in D.
+`explain` does all of this without help. From series A it takes 0.45 mm to 0.17 mm, by the gear, by
+gravity, by formulas over lift and pan, and by a second order of the gear. The arm that this
+describes, with only base and tool free, predicts series D to 0.28 mm; geometry that is fitted to D
+itself leaves 0.40 mm there. A last formula, over wrist 3, turns the tool. Orientations err less in
+A with it, and more in D.
 
 DATA are those of example 6: https://github.com/christianlandgraf/ipa-robot-accuracy (MIT licence).
 

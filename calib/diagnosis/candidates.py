@@ -41,6 +41,12 @@ def known_effects(
     return found
 
 
+def one_more_wave(effect: Effect, model: Model) -> bool:
+    """Whether a model has a wave of an effect's family already, and this is another. Any shape can
+    be taken for many waves, so they come after all else."""
+    return not effect.jumps and any(e.family == effect.family for e in model.effects)
+
+
 def _others(effect: Effect, grid: Sequence[float], model: Model) -> list[float]:
     """The shapes of a grid that a model has not. Next to a smooth one that it has, another only
     says that this one is a little off; so of these, one of the grid lies between."""

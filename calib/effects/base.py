@@ -286,6 +286,11 @@ class ShapeStep(Effect):
         return f"shape of {effect.name}"
 
     @property
+    def family(self) -> str:
+        """Each is one by itself: two slips may both go to a time between them."""
+        return self.name
+
+    @property
     def of_lidar(self) -> bool:
         return self.effect.of_lidar
 

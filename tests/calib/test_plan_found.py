@@ -41,7 +41,10 @@ def test_what_would_be_found_after_the_plan_is_found_by_the_stops_it_asks_for(pl
     # Short beams are not counted on, nor is known what time the stops take: no more is promised.
     timed = ["arm_joint_creep", "warmup_drift"]
     less = np.isin(np.array(names)[told], ["near_range_bias", *timed])
-    np.testing.assert_allclose(off[~less], 1.0, atol=0.1)
+    # A table of rings is asked for in the middle of the stops, another time once there are more.
+    moved = np.isin(np.array(names)[told], ["ring_elevation_slip", "ring_azimuth_slip"])
+    np.testing.assert_allclose(off[~less & ~moved], 1.0, atol=0.1)
+    np.testing.assert_allclose(off[moved], 1.0, atol=0.2)
     assert (off[less] > 1.0).all()
     assert np.median(np.abs(off - 1.0)) < 0.03
     assert np.median(sizes[told, 1] / sizes[told, 0]) < 0.9  # the stops bring something

@@ -6,9 +6,10 @@ import pytest
 
 from calib.diagnosis.candidates import known_effects
 from calib.diagnosis.search import MOST_NEEDED
+from calib.diagnosis.search.shapes import retuned
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose
+from calib.runs.diagnose import diagnose, stand_of
 from calib.runs.explain import explain
 from calib.runs.reopen import model_of
 
@@ -53,10 +54,36 @@ def test_a_tracker_that_slips_twice_is_named_at_both_times(tmp_path):
     assert when == [first, again]
 
 
+def test_two_slips_may_go_to_one_time_between_them(tmp_path):
+    """Of slips a stop apart, either may be better there; that ended a diagnosis."""
+    world, joints, rng = arm_of(tmp_path / "rec", 6)
+    seen = world.seen(joints) * arm_worlds.exp(arm_worlds.noise(rng, POSES))
+    columns = {"elapsed_s": 10.0 * np.arange(POSES)}
+    arm_worlds.save(tmp_path / "rec", world, joints, seen, columns)
+    model = ("arm_link_length", "arm_joint_offset", "tracker_slip@395", "tracker_slip@415")
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(model))
+    slips = [effect.name for effect in model_of(run).effects if effect.family == "tracker_slip"]
+    stand, _ = retuned(stand_of(run, lambda *_: None, ()), slips, lambda *_: None)
+    assert {*slips} <= {*stand.model.names}
+
+
 def test_a_gear_that_errs_in_two_orders_is_named_in_both(tmp_path):
     write_erring(tmp_path / "rec", [(1, 100, 3e-4), (2, 50, 2e-4)], seed=1)
     found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
     assert set(found.worth_adding) == {"arm_gear_error@100", "arm_gear_error@50"}
+
+
+def test_another_order_of_a_gear_comes_after_all_else(tmp_path):
+    """Though it explains more: what is no wave can be taken for many of them."""
+    world, joints, rng = arm_of(tmp_path / "rec", 5)
+    true = joints.copy()
+    true[:, 1] += 5e-4 * np.sin(8 * joints[:, 1])
+    true[:, 2] += 4e-4 * np.sin(17 * joints[:, 2])
+    true[:, 3] *= 1.0 + 2e-4
+    noise = arm_worlds.exp(arm_worlds.noise(rng, POSES))
+    arm_worlds.save(tmp_path / "rec", world, joints, world.seen(true) * noise)
+    found = diagnose(calibrate([tmp_path / "rec"], tmp_path / "run"))
+    assert found.worth_adding == ["arm_gear_error@8", "arm_joint_scale", "arm_gear_error@17"]
 
 
 # Six joints, each of which errs.

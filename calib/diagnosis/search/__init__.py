@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from calib.blunders.judged import Blunder, LeftOut
+from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.chance import Chance
 from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import (
@@ -39,9 +38,6 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
-# Log odds from which a rival takes the name: evidence of 150 to 1 is called very strong (Kass and
-# Raftery 1995, JASA 90).
-FAR_MORE = np.log(150.0)
 
 
 @dataclass(frozen=True)
@@ -312,8 +308,10 @@ def _explain_all(steps: Steps, progress: Progress) -> bool:
 
 def _named(look: Look, found: list[NamedEffect], progress: Progress) -> list[NamedEffect]:
     """What was found, and the best candidate that is confirmed, fitted; with it others may have
-    better shapes. Which one is best may change once it is fitted, as rows then scatter less."""
-    for candidate in suspects(look.named, ALPHA_EFFECT):
+    better shapes. Which one is best may change once it is fitted, as rows then scatter less. One
+    more wave of a kind that the model has comes after all else."""
+    model, every = look.stand.model, suspects(look.named, ALPHA_EFFECT)
+    for candidate in sorted(every, key=lambda each: one_more_wave(each.effect, model)):
         if more := _fitted(look, candidate, found, progress):
             return _by_likelier(look, more[-1], found, progress) or more
     return found
@@ -328,7 +326,7 @@ def _by_likelier(
     That something of the kind is missing is as sure as the effect named first has it. So a rival of
     no more parameters need not be confirmed by itself.
     """
-    likelier = _likelier(step)
+    likelier = step.likelier
     if likelier is None:
         return []
     sure = step.p_adjusted if likelier.test.dof <= step.candidate.test.dof else None
@@ -391,10 +389,3 @@ def _fitted(
         rivals=rivals_of(look, candidate, before, finest, scale),
     )
     return [f.with_effect(swapped.get(f.effect.name)) for f in (*found, step)]
-
-
-def _likelier(step: NamedEffect) -> Candidate | None:
-    """A rival that explains far more than the named effect does, where rows scatter as they do with
-    that in the model."""
-    best = max(step.rivals, key=lambda rival: rival.more, default=None)
-    return best.candidate if best and best.more > FAR_MORE else None

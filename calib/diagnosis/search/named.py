@@ -5,11 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.score import ScoreTest
 from calib.diagnosis.screen import Candidate, rivals
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Look
 from calib.effects import Effect
+
+# Log odds from which a rival takes the name: evidence of 150 to 1 is called very strong (Kass and
+# Raftery 1995, JASA 90).
+FAR_MORE = np.log(150.0)
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,15 @@ class NamedEffect:
     @property
     def effect(self) -> Effect:
         return self.candidate.effect
+
+    @property
+    def likelier(self) -> Candidate | None:
+        """A rival that explains far more than the named effect does, where rows scatter as they do
+        with that in the model, and is not one more wave."""
+        model = self.before.stand.model
+        every = (rival for rival in self.rivals if not one_more_wave(rival.effect, model))
+        best = max(every, key=lambda rival: rival.more, default=None)
+        return best.candidate if best and best.more > FAR_MORE else None
 
     def with_effect(self, effect: Effect | None) -> NamedEffect:
         """With another shape of its effect, if there is one."""
