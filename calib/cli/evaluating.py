@@ -42,6 +42,10 @@ def evaluate(
             "--at", metavar="FILE.csv", help="Poses (stop, joints) to predict the arm's error at."
         ),
     ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option("--body", help="With --at: of which body on the arm; else the last."),
+    ] = None,
     trust: Trust = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -57,8 +61,10 @@ def evaluate(
     from calib.runs.run import Run
 
     opened = [Run.open(run, trust or ()) for run in runs]
+    if body is not None and at is None:
+        raise InputError("evaluate --body is with --at FILE.csv")
     if at is not None:
-        _predict(opened, at, out, raw, as_json)
+        _predict(opened, at, out, body, raw=raw, as_json=as_json)
         return
     with executing(workers, scheduler), progress_bar() as progress:
         evaluations = evaluate_all(opened, out, raw, progress)
@@ -72,13 +78,15 @@ def evaluate(
     end_unless_converged(*opened)
 
 
-def _predict(runs: list[Run], at: Path, out: Path | None, raw: bool, as_json: bool) -> None:
+def _predict(
+    runs: list[Run], at: Path, out: Path | None, body: str | None, *, raw: bool, as_json: bool
+) -> None:
     if len(runs) > 1 or raw:
         raise InputError("evaluate --at is of one run, and without --raw")
     from calib.evaluation.at_poses import evaluate_at
 
     with progress_bar() as progress:
-        found = evaluate_at(runs[0], at, out, progress)
+        found = evaluate_at(runs[0], at, out, progress, body)
     warn(runs, as_json)
     if as_json:
         print_json(found.document())

@@ -8,7 +8,7 @@ the base included where nothing else tells it. It covers what is in the model.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.results.intervals import Intervals, intervals
-from calib.results.reach import body_beyond, columns_at, joint_range, placed
+from calib.results.reach import Beyond, bodies_beyond, body_beyond, columns_at, joint_range, placed
+from calib.rig import Rig
 from calib.runs.asked.factors import estimate_of, prior_of
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
@@ -32,6 +33,9 @@ from chains.errors import InputError, NoColumnError
 from sensors.stops import CsvTable, write_columns
 
 AXES = ("x", "y", "z")
+# Of the span of a joint's measured angles, by which a pose lies beyond these: a choice, as any new
+# pose may lie a little beyond.
+FAR_BEYOND = 0.1
 WORKSPACE_POSES = 800  # that are drawn: enough to see where an arm is off, in a picture of 10 cm
 
 
@@ -47,6 +51,7 @@ class Predicted:
         error: (K, 6) rotation rad, then m: true less drawn.
         covariance: (K, 6, 6) of the true place.
         warnings: what is to stand above everything that is shown of the run.
+        beyond: joint -> at how many poses it is beyond all angles that were measured.
     """
 
     body: str
@@ -56,6 +61,7 @@ class Predicted:
     error: np.ndarray
     covariance: np.ndarray
     warnings: Sequence[str] = ()
+    beyond: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def error_m(self) -> np.ndarray:
@@ -86,6 +92,7 @@ class Predicted:
             "body": self.body,
             "frame": self.frame,
             "poses": len(self.names),
+            "beyond_measured": dict(self.beyond),
             **{n: {"mean": 1e3 * v.mean(), "max": 1e3 * v.max()} for n, v in told.items()},
         }
 
@@ -96,6 +103,7 @@ def evaluate_at(
     poses: Path | str,
     out: Path | str | None = None,
     progress: Progress = lambda what, done, total: None,
+    body: str | None = None,
 ) -> Predicted:
     """Predict the arm's error at poses of a CSV file.
 
@@ -104,16 +112,23 @@ def evaluate_at(
         poses: a row a pose: `stop`, the joints by name, and the covariates that effects ask for.
         out: the CSV file to write; none where None.
         progress: called with what is being done, and how far it is.
+        body: whose place, of the tracked bodies that the arm carries; the last of them where None.
 
     Raises:
-        InputError: the file lacks a joint or a covariate, or no tracked body hangs from the arm.
+        InputError: the file lacks a joint or a covariate, or no tracked body hangs from the arm, or
+            none of this name.
     """
     estimate = estimate_of(run, progress)
     problem = estimate.problem
-    if body_beyond(problem) is None:
+    if not (there := bodies_beyond(problem)):
         raise InputError(
             f"{run.folder}: no tracked body hangs from an arm in its recordings, so there is no "
             f"place to predict"
+        )
+    beyond = body_beyond(problem, body)
+    if beyond is None:
+        raise InputError(
+            f"the arm of {run.folder} carries no body '{body}', but: {', '.join(there)}"
         )
     if not says_where_the_base_is(problem):
         raise InputError(
@@ -123,7 +138,7 @@ def evaluate_at(
     told = _known(run, estimate, progress)
     read = _read(Path(poses), problem)
     try:
-        found = _predicted(run, *told, *read)
+        found = _predicted(run, beyond, *told, *read)
     except NoColumnError as error:
         raise InputError(
             f"{poses}: an effect of the model looks at '{error.column}'; add the column "
@@ -134,7 +149,16 @@ def evaluate_at(
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
         with outputs.file(out, [run.folder, *run.inputs, poses]) as file:
             write_columns(file, found.columns())
-    return found
+    measured = problem.sources[0].recording.joints[beyond.stops]
+    return replace(found, beyond=_beyond_measured(problem.sources[0].rig, measured, read[1]))
+
+
+def _beyond_measured(rig: Rig, measured: np.ndarray, joints: np.ndarray) -> dict[str, int]:
+    """Joint -> at how many poses (K, J) it is beyond those that were measured (M, J)."""
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    margin = FAR_BEYOND * (high - low)
+    count = ((joints < low - margin) | (joints > high + margin)).sum(axis=0)
+    return {n: int(k) for n, k in zip(rig.joint_names, count, strict=True) if k}
 
 
 def says_where_the_base_is(problem: Problem) -> bool:
@@ -154,16 +178,16 @@ def _known(run: Run, estimate: Estimate, progress: Progress) -> tuple[Estimate, 
 
 def _predicted(
     run: Run,
+    beyond: Beyond,
     estimate: Estimate,
     known: Intervals,
     names: Sequence[str],
     joints: np.ndarray,
     columns: Mapping[str, np.ndarray],
 ) -> Predicted:
-    """Where the arm of the first recording truly brings its last tracked body, and as drawn, at K
-    poses with these joints (K, J) and covariates (K,); see the module."""
-    problem = estimate.problem
-    rig, beyond = problem.sources[0].rig, body_beyond(problem)
+    """Where the arm of the first recording truly brings a tracked body, and as drawn, at K poses
+    with these joints (K, J) and covariates (K,); see the module."""
+    problem, rig = estimate.problem, estimate.problem.sources[0].rig
     stops = place(rig, problem.terms[0], joints, columns, beyond.root, None)
     true = placed(stops, beyond.body, beyond.base, estimate.values)
     bends = {t.variable for t in problem.terms[0] if not isinstance(t.effect, FrameOffset)}
@@ -194,7 +218,8 @@ def over_workspace(
         progress: called with what is being done, and how far it is.
     """
     problem = estimate.problem
-    source, stops = problem.sources[0], body_beyond(problem).stops
+    source, beyond = problem.sources[0], body_beyond(problem)
+    stops = beyond.stops
     rng, measured = np.random.default_rng(0), source.recording.joints
     some = np.sort(rng.choice(stops, min(len(stops), WORKSPACE_POSES), replace=False))
     at_stop = rng.choice(stops, WORKSPACE_POSES)
@@ -205,7 +230,7 @@ def over_workspace(
     for at, joints in ((some, measured[some]), (at_stop, drawn)):
         columns = columns_at(source, at, joints)
         names = [source.recording.stops[i] for i in at.tolist()]
-        found.append(_predicted(run, *told, names, joints, columns))
+        found.append(_predicted(run, beyond, *told, names, joints, columns))
     return found[0], found[1]
 
 

@@ -138,11 +138,19 @@ class Beyond:
     stops: np.ndarray
 
 
-def body_beyond(problem: Problem) -> Beyond | None:
-    """The last tracked body beyond the joints of the first rig; None where there is none."""
+def bodies_beyond(problem: Problem) -> list[str]:
+    """All tracked bodies beyond the joints of the first rig."""
+    source = problem.sources[0]
+    every = (b.body for b in problem.bodies if _is_of(b, source))
+    return list(dict.fromkeys(body for body in every if source.rig.joints_to(body)))
+
+
+def body_beyond(problem: Problem, name: str | None = None) -> Beyond | None:
+    """The last tracked body beyond the joints of the first rig, or that of a name; None where there
+    is none."""
     source, rig = problem.sources[0], problem.sources[0].rig
     blocks = [b for b in problem.bodies if _is_of(b, source)]
-    beyond = [b for b in blocks if rig.joints_to(b.body)]
+    beyond = [b for b in blocks if rig.joints_to(b.body) and name in (None, b.body)]
     if not beyond:
         return None
     body = beyond[-1].body

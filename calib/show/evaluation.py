@@ -60,6 +60,11 @@ def print_predicted(found: Mapping[str, Any], out: Path | None) -> None:
         table.add_row(what, mm(found[name]["mean"]), mm(found[name]["max"]))
     console.print(f"'{found['body']}' at {found['poses']} poses, in the axes of '{found['frame']}'")
     console.print(table)
+    if found["beyond_measured"]:
+        each = [f"{name} at {count} poses" for name, count in found["beyond_measured"].items()]
+        console.print(
+            f"Beyond all that was measured, where nothing checks the model: {', '.join(each)}."
+        )
     console.print(f"pose by pose: {out}" if out else "-o FILE.csv writes it pose by pose")
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 
 from calib.evaluation.arm import Arm
 from calib.evaluation.at_poses import evaluate_at, over_workspace
-from calib.problem.model import Model, default_effects
+from calib.problem.model import Model, Source, default_effects
 from calib.report.charts.bodies import workspace
 from calib.report.evidence import Evidence
 from calib.runs.calibrate import calibrate
@@ -101,6 +101,18 @@ def test_far_from_the_measured_poses_less_is_known(world):
     # A quantile of 95 % in space is about 1.6 times the root mean square.
     assert told["sigma_mm"]["mean"] == pytest.approx(at_poses / 1.6, rel=0.3)
     json.dumps(told)
+
+
+def test_poses_beyond_what_was_measured_are_counted(world, tmp_path):
+    _, run, joints, _ = world
+    source = Source.open(run.recordings[0])
+    far = joints[:20].copy()
+    low, high = source.recording.joints.min(axis=0), source.recording.joints.max(axis=0)
+    far[:7, 1] = high[1] + 0.2 * (high - low)[1]
+    far[7:9, 4] = low[4] - 0.2 * (high - low)[4]
+    write(tmp_path / "far.csv", source, far)
+    names = source.rig.joint_names
+    assert evaluate_at(run, tmp_path / "far.csv").beyond == {names[1]: 7, names[4]: 2}
 
 
 def test_a_report_shows_the_workspace_and_where_the_poses_end(world, tmp_path):

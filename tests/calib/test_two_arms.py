@@ -6,6 +6,8 @@ import yaml
 from scipy.stats import chi2
 
 import calib
+from calib.evaluation.arm import Arm
+from calib.evaluation.at_poses import evaluate_at
 from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.report import report
@@ -149,3 +151,17 @@ def test_tips_that_make_no_sense_are_refused(tmp_path, arms, tip, said):
     two_arms.write(tmp_path / "rec", arms, 3, np.random.default_rng(1), tip=tip)
     with pytest.raises(InputError, match=said):
         Source.open(tmp_path / "rec")
+
+
+def test_each_hand_is_predicted_at_any_pose(run, recording, tmp_path):
+    """Where the corrected arm brings it; a hand that there is not is said."""
+    table, joints = tmp_path / "poses.csv", Source.open(recording).recording.joints[:9] / 2
+    rows = [["stop", *two_arms.JOINTS], *([f"p{k}", *q] for k, q in enumerate(joints.tolist()))]
+    table.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    for hand in ("left_hand_tool", "right_hand_tool"):
+        found = evaluate_at(run, table, body=hand)
+        assert found.body == hand
+        ours = Arm.of(run, tip=hand).corrected(joints)
+        np.testing.assert_allclose(found.place_m, ours[:, :3, 3], atol=1e-9)
+    with pytest.raises(InputError, match="no body 'head', but: left_hand_tool, right_hand_tool"):
+        evaluate_at(run, table, body="head")
