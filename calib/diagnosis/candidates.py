@@ -11,6 +11,8 @@ from calib.effects import CATALOGUE, Effect, Site
 from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
 
+NO_MASSES = "the masses of the arm's links (inertial/mass in its URDF)"
+
 
 def known_effects(
     model: Model,
@@ -84,7 +86,11 @@ def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) 
     if "joints" in effect.covariates and not any(s.rig.joint_names for s in sources):
         missing.append("joints")
     if not missing and not any(effect.params(s.rig) for s in sources):
-        missing.append("hardware that it acts on")
+        weightless = any(s.rig.joint_names for s in sources) and not any(
+            s.rig.masses for s in sources
+        )
+        without_masses = effect.needs_masses and weightless
+        missing.append(NO_MASSES if without_masses else "hardware that it acts on")
     return missing
 
 

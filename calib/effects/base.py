@@ -145,6 +145,7 @@ class Effect(ABC):
         joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
         needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
         needs_standing: True of one about rigs that stand still over several stops.
+        needs_masses: True of one that the weight of an arm's links makes.
         of_members: True where its parameters are one quantity of several rings or labels, whose
             mean is a quantity as well.
         of_volume: True where it is the tracker's error at a place, which markers of targets have as
@@ -174,6 +175,7 @@ class Effect(ABC):
     joint_kind: ClassVar[str] = ""
     needs_lidar: ClassVar[bool] = False
     needs_standing: ClassVar[bool] = False
+    needs_masses: ClassVar[bool] = False
     of_members: ClassVar[bool] = False
     of_volume: ClassVar[bool] = False
     by_chance: ClassVar[bool] = False

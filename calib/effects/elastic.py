@@ -36,6 +36,7 @@ class ArmGravitySag(Effect):
     covariates = ("joints",)
     confounded_with = ("arm_joint_eccentricity", "base_flex", "arm_joint_offset")
     source = "stiffness of arms: Klimchik et al.; size assumed"
+    needs_masses = True
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return _per_joint(rig) if rig.masses else ()
@@ -177,6 +178,7 @@ class ArmLinkBending(Effect):
     covariates = ("joints",)
     confounded_with = ("arm_gravity_sag", "base_flex", "arm_geometry")
     source = "stiffness of arms: Klimchik et al.; size assumed"
+    needs_masses = True
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         joints = rig.joint_names if rig.masses else ()
@@ -207,6 +209,7 @@ class BaseFlex(Effect):
     covariates = ("joints",)
     confounded_with = ("arm_gravity_sag", "arm_joint_offset", "arm_base")
     source = "size assumed"
+    needs_masses = True
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param(n, "rad/(N m)", 5e-5) for n in "xy") if rig.masses else ()

@@ -7,14 +7,15 @@ import pandas as pd
 import pytest
 
 import calib
-from calib.effects import View, find
+from calib.diagnosis.candidates import NO_MASSES, lacking
+from calib.effects import CATALOGUE, View, find
 from calib.problem.build import stops_view
 from calib.problem.model import Source
 from calib.rig.columns import recorded_columns, stop_columns
 from calib.simulation import load_spec
 from chains.errors import InputError
 
-from . import two_arms
+from . import rigs, two_arms
 from .hidden import hide, placed, stops_of
 from .simulated import changed, made
 
@@ -223,3 +224,13 @@ def test_a_joint_that_gives_way_is_named_by_what_it_gives_way_to(tmp_path, name)
     made(tmp_path / "rec", spec, 2, **{name: 0.5})
     run = calib.fit(tmp_path / "rec", tmp_path / "run", hold_out="none")
     assert calib.diagnose(run, refits=False).worth_adding == [name]
+
+
+def test_what_weight_does_is_said_to_need_masses(tmp_path):
+    """Of an arm whose URDF has none; no other effect lacks any."""
+    source = Source.open(rigs.write(tmp_path / "rec"))
+    assert source.rig.joint_names and not source.rig.masses
+    lacked = {e.name: lacking(e, [source], frozenset(source.columns)) for e in CATALOGUE}
+    assert {name for name, what in lacked.items() if NO_MASSES in what} == {
+        "arm_gravity_sag", "arm_link_bending", "base_flex"
+    }  # fmt: skip
