@@ -10,7 +10,7 @@ import pytest
 from calib.diagnosis import search as steps
 from calib.diagnosis.candidates import shape_limits
 from calib.diagnosis.search import nameless, search
-from calib.diagnosis.search.named import Rival
+from calib.diagnosis.search.named import NamedEffect, Rival
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.verdict.matters import Consequences
 from calib.effects import GEOMETRY, find
@@ -206,16 +206,32 @@ def test_a_joint_that_slipped_is_not_the_tracker_or_the_mount(tmp_path, arm):
 
 
 @pytest.mark.parametrize(
-    ("more", "dof", "sure"), [(6.0, 1, 0.01), (6.0, 6, None), (1.0, 1, "kept")]
+    ("more", "dof", "sure", "there"),
+    [
+        (6.0, 1, 0.01, ()),
+        (6.0, 6, None, ()),
+        (1.0, 1, "kept", ()),
+        (6.0, 1, "kept", ("arm_gear_error@17",)),
+    ],
 )
 def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
-    monkeypatch, more, dof, sure
+    monkeypatch, more, dof, sure, there
 ):
-    """That something is missing is confirmed; which of two of one parameter it is, the odds say."""
+    """That something is missing is confirmed; which of two of one parameter it is, the odds say.
+    One more order of a gear that the model has takes no name."""
 
-    named, rival = (SimpleNamespace(test=SimpleNamespace(dof=each)) for each in (1, dof))
-    rivals = [Rival(rival, log_odds=-more, more=more)]
-    step = SimpleNamespace(candidate=named, rivals=rivals, p_adjusted=0.01)
+    named, rival = (
+        SimpleNamespace(test=SimpleNamespace(dof=each), effect=find(name))
+        for each, name in ((1, "arm_gravity_sag"), (dof, "arm_gear_error@8"))
+    )
+    step = NamedEffect(
+        candidate=named,
+        before=SimpleNamespace(stand=SimpleNamespace(model=Model(there))),
+        after=None,
+        judged=None,
+        p_adjusted=0.01,
+        rivals=[Rival(rival, log_odds=-more, more=more)],
+    )
     asked = []
     monkeypatch.setattr(steps, "_fitted", lambda *a, sure: asked.append((a[1], sure)) or [rival])
     found = steps._by_likelier(None, step, [], None)
