@@ -1,6 +1,9 @@
-"""How alike two logs of speed are, one shifted against the other."""
+"""How alike two logs of speed are, one shifted against the other, whole or in parts."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,6 +13,9 @@ LEAST_LIKE = 0.75  # correlation below which two motions are not the same
 RIVAL = 0.8  # of the best evidence, at another offset: then nobody knows which is right
 LOBE_S = 1.0  # within it of the best, a peak is the same one
 LEAST_OVERLAP = 0.3  # of the shorter log
+LOG_PARTS = 8  # of the logs, whose own offsets tell the uncertainty
+REACH_S = 0.25  # the offset of a part is sought within it: a clock 100 ppm off needs 40 min for it
+LEAST_S = 2.0  # of a log: less has not one move of an arm in it
 
 
 def likeness_of(a: Array, b: Array) -> tuple[Array, Array, Array]:
@@ -68,3 +74,70 @@ def correlation(a: Array, b: Array) -> float:
     if both.sum() < 3 or a[both].std() < 1e-4 or b[both].std() < 1e-4:
         return np.nan
     return float(np.corrcoef(a[both], b[both])[0, 1])
+
+
+def parts_of(a: Array, b: Array, lag: int, step_s: float) -> tuple[Array, Array]:
+    """Of parts of the logs, where the motion of each is in the first, in steps, and by how many
+    seconds its own offset differs from that of all; parts that tell nothing are left out.
+
+    Each is sought about the offset of all, then about the line through those found, as clocks that
+    drift leave the reach of the former; and those not found, as clocks may drift unevenly, about
+    what the two found next to it lead to.
+    """
+    start, end = max(0, -lag), min(len(a), len(b) - lag)
+    reach = max(2, round(REACH_S / step_s))
+    parts = list(pairwise(np.linspace(start, end, LOG_PARTS + 1).astype(int)))
+    middle = np.array([low + _middle(a[low:high]) for low, high in parts])
+    about, found = np.zeros(len(parts)), np.full(len(parts), np.nan)
+    for _ in range(2):
+        for i, (low, high) in enumerate(parts):
+            found[i] = _own_lag(a, b, (low, high), lag + round(about[i]), reach, step_s) - lag
+        told = np.isfinite(found)
+        if told.sum() < 3:
+            break
+        about = np.polyval(np.polyfit(middle[told], found[told], 1), middle)
+    for i, low, high in _from_neighbours(found, parts):
+        near = np.flatnonzero(np.isfinite(found))
+        near = near[np.argsort(np.abs(near - i), kind="stable")[:2]]
+        led = np.polyval(np.polyfit(middle[near], found[near], len(near) - 1), middle[i])
+        for guess in (led, found[near[0]]):
+            if np.isnan(found[i]):
+                found[i] = _own_lag(a, b, (low, high), lag + round(guess), reach, step_s) - lag
+    told = np.isfinite(found)
+    return middle[told], found[told] * step_s
+
+
+def _from_neighbours(
+    found: Array, parts: Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, int, int]]:
+    """The parts, with their numbers, that are not found, outward from those that are."""
+    known = np.flatnonzero(np.isfinite(found))
+    if len(known):
+        away = np.abs(np.arange(len(parts))[:, None] - known).min(axis=1)
+        for i in np.argsort(away, kind="stable")[len(known) :].tolist():
+            yield i, *parts[i]
+
+
+def _middle(speed: Array) -> float:
+    """Where a log tells its offset, in steps: at changes of speed, by the square of each."""
+    told = np.nan_to_num(np.diff(speed)) ** 2
+    if not told.any():
+        return len(speed) / 2
+    return float(np.average(np.arange(len(told)) + 0.5, weights=told))
+
+
+def _own_lag(
+    a: Array, b: Array, part: tuple[int, int], lag: int, reach: int, step_s: float
+) -> float:
+    """The lag of a part of a log, within a reach about a lag, to a fraction of a step; NaN where it
+    is too short, moves too little, or is like the other nowhere there."""
+    low, high = max(part[0], reach - lag, 0), min(part[1], len(b) - lag - reach)
+    if (high - low) * step_s < LEAST_S / 2:
+        return np.nan
+    shifts = np.arange(-reach, reach + 1)
+    like = [correlation(a[low:high], b[low + lag + s : high + lag + s]) for s in shifts]
+    if not np.isfinite(like).all() or max(like) < LEAST_LIKE:
+        return np.nan
+    k = int(np.argmax(like))
+    at_end = k in (0, len(shifts) - 1)
+    return np.nan if at_end else lag + shifts[k] + vertex(np.array(like), k)
