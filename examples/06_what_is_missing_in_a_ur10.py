@@ -15,8 +15,8 @@ What is of the arm and not of the series carries over. With the arm as A found i
 tool free, D's error falls from 0.46 to 0.36 mm, below the 0.40 mm to which geometry alone can be
 fitted to D itself. From D to A it falls from 0.54 to 0.44 mm.
 
-`rigcal explain` goes on without help, by formulas, to 0.18 mm held out in A and 0.29 mm in D, and
-then says that structure without a name is left. It is right: 0.18 mm is three times the
+`rigcal explain` goes on without help, by formulas, to 0.17 mm held out in A and 0.29 mm in D, and
+then says that structure without a name is left. It is right: 0.17 mm is nearly three times the
 repeatability. Growth with temperature is not significant (p = 0.5 in A, 0.7 in D).
 
     python examples/06_what_is_missing_in_a_ur10.py [FOLDER] [DATA]

@@ -190,7 +190,11 @@ def _offset(
     elif len(best.added.at_s) > 1:
         shape = "a straight line" if len(best.added.at_s) == 2 else "straight pieces"
         within_s = float(np.ptp(best.added.offset_s))
-        there = f", {within_s:.3f} s in between" if within_s > 2 * abs(best.drift_s) else ""
+        there = (
+            f", and by as much as {within_s:.3f} s in between"
+            if within_s > 2 * abs(best.drift_s)
+            else ""
+        )
         out.odd.append(
             f"clock {clock} drifts by {best.drift_s:+.3f} s from the beginning to the end{there}; "
             f"its times were corrected along {shape}"
@@ -253,7 +257,9 @@ def estimate(mine: Motion, other: Motion) -> Offset | None:
         return Offset(offset_s, np.nan, top, added=always)
     at, shift_s = parts_of(a, b, int(lag[best]), step_s)
     drift_s = _drift(shift_s)
-    if abs(drift_s) < DRIFT_S and not _bends(shift_s):
+    if _bends(shift_s):
+        drift_s = drift_s or float(shift_s[-1] - shift_s[0])
+    elif abs(drift_s) < DRIFT_S:
         return Offset(offset_s, _standard_error(shift_s, step_s), top, added=always)
     ahead_s = float(other.time_s[0] - mine.time_s[0]) + int(lag[best]) * step_s
     added, missed_s = _pieces(mine.time_s[0] + at * step_s, ahead_s + shift_s)
