@@ -86,11 +86,11 @@ def lacking(effect: Effect, sources: Sequence[Source], columns: frozenset[str]) 
     if "joints" in effect.covariates and not any(s.rig.joint_names for s in sources):
         missing.append("joints")
     if not missing and not any(effect.params(s.rig) for s in sources):
-        weightless = any(s.rig.joint_names for s in sources) and not any(
-            s.rig.masses for s in sources
+        arms = [s.rig for s in sources if s.rig.joint_names]
+        weightless = arms and not any(rig.masses for rig in arms)
+        missing.append(
+            NO_MASSES if effect.needs_masses and weightless else "hardware that it acts on"
         )
-        without_masses = effect.needs_masses and weightless
-        missing.append(NO_MASSES if without_masses else "hardware that it acts on")
     return missing
 
 

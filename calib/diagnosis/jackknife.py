@@ -139,7 +139,8 @@ def by_signs(ways: Sequence[np.ndarray], stops: int, spent: int = 0) -> ScoreSpr
         stops: how many stops have a share in it; one tells nothing.
         spent: how many unknowns of the model differ by stop alone.
     """
-    return spread_by([ShareSquares.of(shares) for shares in ways], stops, spent)
+    whole = [ShareSquares.each_of(shares, [shares.shape[1]]) for shares in ways]
+    return spread_by([squares for (squares,) in whole], stops, spent)
 
 
 def spread_by(ways: Sequence[ShareSquares], stops: int, spent: int = 0) -> ScoreSpread:
@@ -176,10 +177,6 @@ class ShareSquares(NamedTuple):
     sum: np.ndarray
     each: np.ndarray
     products: np.ndarray
-
-    @classmethod
-    def of(cls, shares: np.ndarray) -> Self:
-        return cls(shares.sum(axis=0), squares_of(shares), shares.T @ shares)
 
     @classmethod
     def each_of(cls, shares: np.ndarray, ends: Sequence[int]) -> list[Self]:
@@ -238,7 +235,7 @@ class Clusters:
     @cached_property
     def trace(self) -> np.ndarray:
         """(c,) of the information of each, which is no less than that along any direction."""
-        return np.bincount(self.at, np.einsum("ij,ij->i", self.rows, self.rows), self.size)
+        return np.bincount(self.at, squares_of(self.rows), self.size)
 
     @cached_property
     def information(self) -> np.ndarray:

@@ -316,17 +316,18 @@ def score_tests(scores: Scores, sets: Sequence[np.ndarray]) -> list[ScoreTest]:
     whiten = block_diag(*(each for each, _ in every))
     ends = np.cumsum([each.shape[1] for each, _ in every]).tolist()
     shares = [way @ whiten for way in scores.ways(np.concatenate(sets))]
-    squares = [ShareSquares.each_of(way, ends) for way in shares]
-    return [
-        ScoreTest(
-            columns=columns,
-            statistic=statistic,
-            whiten=each,
-            chances=(spread_by(ways, clusters, scores.spent),),
-            clusters=clusters,
-            score=scores.score[columns],
-            spent=scores.spent,
+    squares, tests = [ShareSquares.each_of(way, ends) for way in shares], []
+    for columns, (each, statistic), *ways in zip(sets, every, *squares, strict=True):
+        clusters = int(np.count_nonzero(ways[0].each[: scores.sharing]))
+        tests.append(
+            ScoreTest(
+                columns=columns,
+                statistic=statistic,
+                whiten=each,
+                chances=(spread_by(ways, clusters, scores.spent),),
+                clusters=clusters,
+                score=scores.score[columns],
+                spent=scores.spent,
+            )
         )
-        for columns, (each, statistic), *ways in zip(sets, every, *squares, strict=True)
-        for clusters in [int(np.count_nonzero(ways[0].each[: scores.sharing]))]
-    ]
+    return tests

@@ -21,8 +21,15 @@ from calib.forward import Placed, place
 from calib.linear.parallel import one_blas_thread
 from calib.problem import Problem
 from calib.results.intervals import Intervals, intervals
-from calib.results.reach import Beyond, bodies_beyond, body_beyond, columns_at, joint_range, placed
-from calib.rig import Rig
+from calib.results.reach import (
+    Beyond,
+    bodies_beyond,
+    body_beyond,
+    columns_at,
+    far_beyond,
+    joint_range,
+    placed,
+)
 from calib.runs.asked.factors import estimate_of, prior_of
 from calib.runs.reopen import model_of
 from calib.runs.run import Run
@@ -33,9 +40,6 @@ from chains.errors import InputError, NoColumnError
 from sensors.stops import CsvTable, write_columns
 
 AXES = ("x", "y", "z")
-# Of the span of a joint's measured angles, by which a pose lies beyond these: a choice, as any new
-# pose may lie a little beyond.
-FAR_BEYOND = 0.1
 WORKSPACE_POSES = 800  # that are drawn: enough to see where an arm is off, in a picture of 10 cm
 
 
@@ -149,16 +153,10 @@ def evaluate_at(
             raise InputError(f"{out}: the poses are written as a table; give FILE.csv")
         with outputs.file(out, [run.folder, *run.inputs, poses]) as file:
             write_columns(file, found.columns())
-    measured = problem.sources[0].recording.joints[beyond.stops]
-    return replace(found, beyond=_beyond_measured(problem.sources[0].rig, measured, read[1]))
-
-
-def _beyond_measured(rig: Rig, measured: np.ndarray, joints: np.ndarray) -> dict[str, int]:
-    """Joint -> at how many poses (K, J) it is beyond those that were measured (M, J)."""
-    low, high = measured.min(axis=0), measured.max(axis=0)
-    margin = FAR_BEYOND * (high - low)
-    count = ((joints < low - margin) | (joints > high + margin)).sum(axis=0)
-    return {n: int(k) for n, k in zip(rig.joint_names, count, strict=True) if k}
+    source = problem.sources[0]
+    outside = far_beyond(source.recording.joints[beyond.stops], read[1]).sum(axis=0)
+    counts = zip(source.rig.joint_names, outside.tolist(), strict=True)
+    return replace(found, beyond={name: count for name, count in counts if count})
 
 
 def says_where_the_base_is(problem: Problem) -> bool:

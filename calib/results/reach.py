@@ -27,6 +27,9 @@ DRAWN_ERRORS = 400  # of the calibration that are drawn, the same for every pose
 # From how many times worse elsewhere it is a warning. Measured on an arm of six joints: 300 poses
 # all over the workspace are at 1.4; 40 of them in a box of 0.5 m at 2.1, 20 in one of 0.3 m at 2.6.
 FAR_WORSE = 2.0
+# Of the span of what was measured, from which something lies beyond it: a choice, as any new pose
+# may lie a little beyond.
+BEYOND_SPAN = 0.1
 TOLD_SHARE = 0.95  # of errors that lie below what is told
 
 
@@ -140,16 +143,14 @@ class Beyond:
 
 def bodies_beyond(problem: Problem) -> list[str]:
     """All tracked bodies beyond the joints of the first rig."""
-    source = problem.sources[0]
-    every = (b.body for b in problem.bodies if _is_of(b, source))
-    return list(dict.fromkeys(body for body in every if source.rig.joints_to(body)))
+    joints_to, blocks = problem.sources[0].rig.joints_to, _of_first(problem)
+    return list(dict.fromkeys(b.body for b in blocks if joints_to(b.body)))
 
 
 def body_beyond(problem: Problem, name: str | None = None) -> Beyond | None:
     """The last tracked body beyond the joints of the first rig, or that of a name; None where there
     is none."""
-    source, rig = problem.sources[0], problem.sources[0].rig
-    blocks = [b for b in problem.bodies if _is_of(b, source)]
+    rig, blocks = problem.sources[0].rig, _of_first(problem)
     beyond = [b for b in blocks if rig.joints_to(b.body) and name in (None, b.body)]
     if not beyond:
         return None
@@ -162,8 +163,20 @@ def body_beyond(problem: Problem, name: str | None = None) -> Beyond | None:
     )
 
 
-def _is_of(block: TrackedBody, source: Source) -> bool:
-    return block.stop_names[0][0] == source.recording.folder
+def _of_first(problem: Problem) -> list[TrackedBody]:
+    """The tracked bodies of the first recording."""
+    folder = problem.sources[0].recording.folder
+    return [b for b in problem.bodies if b.stop_names[0][0] == folder]
+
+
+def far_beyond(
+    measured: np.ndarray, others: np.ndarray, least: float | np.ndarray = 0.0
+) -> np.ndarray:
+    """Which (K, ...) of other values lie beyond all measured ones (M, ...), by a share of the span
+    of these, and by no less than that."""
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    margin = np.maximum(BEYOND_SPAN * (high - low), least)
+    return (others < low - margin) | (others > high + margin)
 
 
 def at_joints(problem: Problem, at_stop: np.ndarray | None, joints: np.ndarray, root: str) -> Stops:

@@ -10,10 +10,11 @@ import numpy as np
 
 from calib.planning.stops import Poses
 from calib.problem.model import Source
+from calib.results.reach import far_beyond
 
-# Beyond what was measured, from which a stop is unlike all others: of its span, and at least. A
-# choice: less changes little of what the beams and the tracker see.
-BEYOND_SPAN, BEYOND_LEAST = 0.1, {"rad": np.radians(5.0), "m": 0.02}
+# Beyond what was measured, at least, from which a stop is unlike all others. A choice: less changes
+# little of what the beams and the tracker see.
+BEYOND_LEAST = {"rad": np.radians(5.0), "m": 0.02}
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,8 @@ def _quantities(source: Source, poses: Poses) -> Iterator[tuple[str, bool, str, 
 def _beyond(
     what: str, tilt: bool, unit: str, measured: np.ndarray, planned: np.ndarray
 ) -> Unlike | None:
-    low, high = float(measured.min()), float(measured.max())
-    margin = max(BEYOND_SPAN * (high - low), BEYOND_LEAST[unit])
-    out = planned[(planned < low - margin) | (planned > high + margin)]
+    out = planned[far_beyond(measured, planned, BEYOND_LEAST[unit])]
     if not len(out):
         return None
-    ends = float(out.min()), float(out.max())
-    return Unlike(what=what, tilt=tilt, unit=unit, planned=ends, measured=(low, high))
+    ends, so_far = ((float(some.min()), float(some.max())) for some in (out, measured))
+    return Unlike(what=what, tilt=tilt, unit=unit, planned=ends, measured=so_far)
