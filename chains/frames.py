@@ -32,16 +32,25 @@ class Joint:
     shift: float = 0.0
 
     @property
+    def unit(self) -> str:
+        """Return the unit of its motion."""
+        return "rad" if self.kind == "revolute" else "m"
+
+    @property
     def screw(self) -> Array:
         """Return the tangent (6,) of the motion per radian or metre of the joint's value."""
-        moving, still = self.factor * self.axis, np.zeros(3)
-        parts = [moving, still] if self.kind == "revolute" else [still, moving]
-        return np.concatenate(parts)
+        return self.factor * self.along
+
+    @property
+    def along(self) -> Array:
+        """Return the tangent (6,) of the motion per radian or metre that the axis itself goes."""
+        parts = [self.axis, np.zeros(3)]
+        return np.concatenate(parts if self.kind == "revolute" else parts[::-1])
 
     @property
     def unshifted(self) -> Array:
         """Return what takes the shift out of a follower's origin again, (4, 4)."""
-        return se3.exp(-self.shift / self.factor * self.screw) if self.shift else np.eye(4)
+        return se3.exp(-self.shift * self.along) if self.shift else np.eye(4)
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ COLUMN_WORDS = {
     "elapsed_s": "time",
     "temperature_c": "temperature",
     "joints": "the arm's pose",
+    "tracked": "where the tracked bodies stand",
     "intensity": "intensity",
 }
 

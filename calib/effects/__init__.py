@@ -45,9 +45,11 @@ from calib.effects.beams import (
 from calib.effects.drives import (
     ArmBacklash,
     ArmGearError,
+    ArmJointCoupling,
     ArmJointEccentricity,
     ArmJointLag,
     ArmJointScale,
+    ArmMimicRatio,
     ArmScrewError,
 )
 from calib.effects.elastic import (
@@ -146,6 +148,8 @@ CATALOGUE: tuple[Effect, ...] = (
     ArmAxisTilt(),
     ArmGeometry(),
     ArmJointScale(),
+    ArmJointCoupling(),
+    ArmMimicRatio(),
     ArmRailBending(),
     ArmJointEccentricity(),
     ArmGravitySag(),

@@ -6,6 +6,7 @@ import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
 from calib.rig import Rig
+from chains.frames import Edge
 
 
 class ArmJointScale(Effect):
@@ -25,6 +26,69 @@ class ArmJointScale(Effect):
 
     def basis(self, view: View) -> np.ndarray:
         return view.joints[:, :, None] * np.eye(view.joints.shape[1])
+
+
+class ArmJointCoupling(Effect):
+    """A joint goes with another: what drives it passes through the joints before it.
+
+    Wrists are driven through each other by shafts and bevel gears, later joints by belts and levers
+    from the base, and the nut of a ball screw slides a shaft that a second nut turns. Whoever reads
+    the motors allows for that, by a ratio that may be off. Each joint may go with the two before
+    it, and one that slides with one that turns after it.
+    """
+
+    name = "arm_joint_coupling"
+    site = Site.JOINTS
+    unit = "1"
+    formula = "q_i = reported_i + c_ik * reported_k, k the two joints before i"
+    typical = "0.01 to 1 percent, size assumed; 1 where it is left out, as of joint 5 in joint 6"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_scale", "arm_joint_offset", "arm_backlash")
+    source = "coupling matrix of Staubli RX arms: softMC wiki, PUMA robot model; size assumed"
+    sigma = 0.01
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        unit = rig.joint_units
+        return tuple(
+            Param.of_joint(joint, _over(unit[joint], unit[other]), self.sigma, f"by_{other}")
+            for joint, other in _coupled(rig)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        names, pairs = view.rig.joint_names, _coupled(view.rig)
+        basis = np.zeros((*view.joints.shape, len(pairs)))
+        for p, (joint, other) in enumerate(pairs):
+            basis[:, names.index(joint), p] = view.joints[:, names.index(other)]
+        return basis
+
+
+class ArmMimicRatio(Effect):
+    """A joint that follows another goes further, or less far, than its URDF's multiplier says."""
+
+    name = "arm_mimic_ratio"
+    site = Site.EDGE
+    unit = "1"
+    formula = "q of a joint that mimics = (multiplier + dm) * reported + offset"
+    typical = "up to 1 percent, size assumed: a pulley, a belt that stretches"
+    covariates = ("joints",)
+    confounded_with = ("arm_joint_scale", "arm_joint_coupling")
+    source = "mimic: https://wiki.ros.org/urdf/XML/joint; size assumed"
+    sigma = 0.01
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(
+            Param(edge.name, _over(edge.joint.unit, rig.joint_units[edge.joint.name]), self.sigma)
+            for edge in _followers(rig)
+        )
+
+    def basis(self, view: View) -> np.ndarray:
+        tree, followers = view.rig.tree, _followers(view.rig)
+        basis = np.zeros((len(view.joints), len(tree.edges), 6, len(followers)))
+        for p, edge in enumerate(followers):
+            # The twist sits before the motion and is along the same screw, so the two add up.
+            q = view.joints[:, view.rig.joint_names.index(edge.joint.name)]
+            basis[:, tree.edge_names.index(edge.name), :, p] = np.outer(q, edge.joint.along)
+        return basis
 
 
 class ArmJointEccentricity(Effect):
@@ -147,3 +211,30 @@ class ArmJointLag(ArmBacklash):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param.of_joint(joint, "1", 0.0005) for joint in rig.joint_names)
+
+
+def _coupled(rig: Rig) -> tuple[tuple[str, str], ...]:
+    """Joints, and those that each may go with, both of them read."""
+    slides = {joint.name for joint in rig.joints} - rig.turning
+    pairs: dict[tuple[str, str], None] = {}
+    for chain in rig.chains:
+        joints = (rig.edge(name).joint for name in chain)
+        names = list(dict.fromkeys(joint.name for joint in joints if joint is not None))
+        names = [name for name in names if name not in rig.passive]
+        for i, name in enumerate(names):
+            after = [
+                other for other in names[i + 1 : i + 2] if name in slides and other not in slides
+            ]
+            pairs |= dict.fromkeys((name, other) for other in (*names[max(i - 2, 0) : i], *after))
+    return tuple(pairs)
+
+
+def _followers(rig: Rig) -> list[Edge]:
+    """The edges of joints that follow one that is read."""
+    edges = [e for e in rig.tree.edges if e.joint is not None and not e.joint.leads]
+    return [edge for edge in edges if edge.joint.name not in rig.passive]
+
+
+def _over(unit: str, other: str) -> str:
+    """The unit of how far a joint goes for each unit of another."""
+    return "1" if unit == other else f"{unit}/{other}"

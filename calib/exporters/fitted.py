@@ -35,6 +35,7 @@ WHERE = {
     Site.REFERENCE: "the reference",
     Site.NOISE: "how much ranges scatter",
 }
+_ROUNDING = 1e-9  # relative, of a basis that is the same as another but for double precision
 _PROBES = 16  # poses at which a basis must be the same to count as fixed
 
 
@@ -73,6 +74,37 @@ class FittedRig:
                 if basis is not None and not np.ptp(basis, axis=0).any():
                     shifts[name] = basis[0] @ self.part.effects[name].estimate
         return shifts
+
+    @cached_property
+    def ratios(self) -> dict[str, dict[str, float]]:
+        """Of each effect by which joints that follow others go further, and no more than that: by
+        how much, by joint, for each rad or m of the joint that is followed."""
+        tree, view, out = self.rig.tree, self._view(_PROBES, {}), {}
+        for name, effect in self.effects.items():
+            basis = _known(effect, view) if effect.site is Site.EDGE else None
+            if basis is None or name in self.fixed:
+                continue
+            left, rates = basis @ self.part.effects[name].estimate, {}
+            size = np.abs(left).max()
+            for e, edge in enumerate(tree.edges):
+                if edge.joint is not None and not edge.joint.leads:
+                    q = view.joints[:, self.rig.joint_names.index(edge.joint.name)]
+                    rates[edge.name] = float(q @ left[:, e] @ edge.joint.along / (q @ q))
+                    left[:, e] -= rates[edge.name] * np.outer(q, edge.joint.along)
+            if np.abs(left).max() <= _ROUNDING * size:
+                out[name] = rates
+        return out
+
+    @property
+    def mimics(self) -> dict[str, tuple[str, float, float]]:
+        """Joints that follow others otherwise than drawn: which, and by what multiplier and offset
+        of the URDF."""
+        out = {}
+        for name in dict.fromkeys(name for rates in self.ratios.values() for name in rates):
+            joint = self.rig.edge(name).joint
+            more = sum(rates.get(name, 0.0) for rates in self.ratios.values())
+            out[name] = (joint.name, joint.factor + more, joint.shift)
+        return out
 
     @cached_property
     def frames(self) -> dict[str, FrameEstimate]:

@@ -11,12 +11,19 @@ from pathlib import Path
 from calib.exporters.fitted import FittedRig, for_every_rig
 from calib.exporters.written import NO_PLACE_FOR_SIGMAS, Unheld, Written, write_text
 from chains.frames import Edge
-from chains.readers.urdf_out import empty_robot, with_comment, with_frames, with_origins
+from chains.readers.urdf_out import (
+    empty_robot,
+    with_comment,
+    with_frames,
+    with_mimics,
+    with_origins,
+)
 
 URDF_CONVENTIONS = (
     "A joint's origin is T_parent_child at a reported joint of 0: xyz in m, in the parent's axes;",
     "rpy in rad about the parent's fixed x, then y, then z. Lengths, tilts and offsets of joints",
     "are in the origins, so joints are given as the encoders report them. Limits are the maker's.",
+    "A joint that follows another has the multiplier that was fitted, where the model has that.",
 )
 
 
@@ -30,10 +37,11 @@ def write_urdf(fit: FittedRig, folder: Path) -> Written:
     tree = fit.rig.tree
     if not tree.edges:
         raise Unheld("the rig has neither an arm nor frames")
-    not_held = [NO_PLACE_FOR_SIGMAS, *fit.not_held(fit.fixed)]
+    not_held = [NO_PLACE_FOR_SIGMAS, *fit.not_held({*fit.fixed, *fit.ratios})]
     files, where = [], fit.rig.arm_urdf or "rig.urdf"
     if fit.rig.arm_urdf:
         arm = with_origins(fit.rig.arm_urdf.read_bytes(), fit.origins, where)
+        arm = with_mimics(arm, fit.mimics, where)
         files.append(fit.file(folder, "arm.urdf"))
         lines = fit.head(URDF_CONVENTIONS, not_held)
         write_text(files[-1], with_comment(arm, lines, where))

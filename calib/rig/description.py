@@ -159,7 +159,7 @@ class Rig:
     @property
     def joint_units(self) -> dict[str, str]:
         """The unit of every joint, by its name."""
-        return {j.name: "rad" if j.kind == "revolute" else "m" for j in self.joints}
+        return {joint.name: joint.unit for joint in self.joints}
 
     @property
     def turning(self) -> frozenset[str]:

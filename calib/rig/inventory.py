@@ -308,7 +308,7 @@ def odd_joints(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     for joint in rig.joints:
         if joint.name not in values:
             continue
-        at, unit = values[joint.name], "rad" if joint.kind == "revolute" else "m"
+        at, unit = values[joint.name], joint.unit
         beyond = (at < joint.lower - LIMIT_SLACK) | (at > joint.upper + LIMIT_SLACK)
         if beyond.any():
             yield (

@@ -1,12 +1,11 @@
-"""What is wrong with tracked bodies, as far as it shows before any fit: placeholders, orders of
-quaternions, bodies exchanged, columns out of step, and poses that no other pose and no joint bears
-out."""
+"""What is wrong with tracked bodies, as far as it shows before any fit: placeholders, quaternions,
+bodies exchanged, columns out of step, and poses that no other pose and no joint bears out."""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -272,7 +271,7 @@ def _stood_still(
 
 
 def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | None:
-    """Joints with another sign, exchanged, or a quarter or half a turn off, if all then fits."""
+    """Joints with another sign, exchanged, turned, or that go with others, if all then fits."""
     pair = pair.some(slice(None, None, max(1, -(-len(pair.stops) // MOST_COMPARED))))
     off = far_off(pair, roots_of(pair))
     if len(pair.stops) < 4 or len(off) < FEWEST_OFF:
@@ -282,8 +281,7 @@ def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | No
     for what, otherwise in _otherwise_read(rig, pair.joints_between(rig), read):
         moved = pair.reading(rig, otherwise)
         left[what] = len(far_off(moved, roots_of(moved)))
-    least = min(left.values(), default=len(off))
-    if least > OUT_OF_STEP * len(off):
+    if (least := min(left.values(), default=len(off))) > OUT_OF_STEP * len(off):
         return None
     ways = ", or if ".join(what for what, count in left.items() if count == least)
     said = (
@@ -295,19 +293,21 @@ def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | No
 
 def _otherwise_read(rig: Rig, names: Sequence[str], read: Array) -> Iterator[tuple[str, Array]]:
     """In what other ways joints could be read, and (K, J) the joints then."""
-    at = {name: rig.joint_names.index(name) for name in names}
+    kind, q = (dict(zip(rig.joint_names, of, strict=True)) for of in (rig.joint_kinds, read.T))
+
+    def but(others: Mapping[str, Array]) -> Array:
+        return np.stack([others.get(name, q[name]) for name in q], axis=1)
+
     for name in names:
-        otherwise = read.copy()
-        otherwise[:, at[name]] *= -1
-        yield f"{name} had the other sign", otherwise
-        for deg in TURNED_DEG if rig.joint_kinds[at[name]] == "revolute" else ():
-            otherwise = read.copy()
-            otherwise[:, at[name]] += np.radians(deg)
-            yield f"{name} read {abs(deg)} deg {'more' if deg > 0 else 'less'}", otherwise
+        yield f"{name} had the other sign", but({name: -q[name]})
+        for deg in TURNED_DEG if kind[name] == "revolute" else ():
+            way = "more" if deg > 0 else "less"
+            yield f"{name} read {abs(deg)} deg {way}", but({name: q[name] + np.radians(deg)})
     for a, b in combinations(names, 2):
-        otherwise = read.copy()
-        otherwise[:, [at[a], at[b]]] = read[:, [at[b], at[a]]]
-        yield f"the columns of {a} and {b} were exchanged", otherwise
+        yield f"the columns of {a} and {b} were exchanged", but({a: q[b], b: q[a]})
+    for a, b in permutations(names, 2):  # rods hold links level, wrists are driven through others
+        for way, sign in (("+", 1), ("-", -1)) if kind[a] == kind[b] else ():
+            yield f"{a} moved by {a} {way} {b}", but({a: q[a] + sign * q[b]})
 
 
 # -------------------------------------------------------------------------------- at one stop

@@ -26,10 +26,12 @@ _Edit = tuple[int, int, bytes]  # start and end in the text, and what comes ther
 
 @dataclass
 class _Joint:
-    """Where a joint's tag and its origin's begin, in bytes, and what hangs from what."""
+    """Where the tags of a joint, its origin and its mimic begin, in bytes, and what hangs from
+    what."""
 
     start: int
     origin: int | None = None
+    mimic: int | None = None
     parent: str = ""
     child: str = ""
 
@@ -63,6 +65,8 @@ class _Robot:
                 self._joint = self.joints[name] = _Joint(at)
             case ["robot", "joint", "origin"] if self._joint.origin is None:
                 self._joint.origin = at
+            case ["robot", "joint", "mimic"] if self._joint.mimic is None:
+                self._joint.mimic = at
             case ["robot", "joint", "parent" | "child" as role]:
                 setattr(self._joint, role, attributes.get("link", ""))
 
@@ -105,6 +109,34 @@ def with_origins(text: bytes, origins: Mapping[str, Array], where: str | Path) -
             edits.append((end, end, b"<origin" + _attributes(T) + b"/>"))
         else:
             edits += _pose_edits(_TAG.match(text, joint.origin)[0], joint.origin, T)
+    return _spliced(text, edits)
+
+
+def with_mimics(
+    text: bytes, mimics: Mapping[str, tuple[str, float, float]], where: str | Path
+) -> bytes:
+    """Return a URDF in which some joints that mimic others do so otherwise.
+
+    Args:
+        text: the file.
+        mimics: joint -> the joint that it follows, its multiplier and its offset, rad or m.
+        where: the file's name, for messages.
+
+    Raises:
+        InputError: as `with_origins`, or such a joint mimics none.
+    """
+    _refuse_wide(text, where)
+    joints, edits = _Robot(text, where).joints, []
+    for name, (other, multiplier, offset) in mimics.items():
+        start = joints[name].mimic if name in joints else None
+        if start is None:
+            raise InputError(f"{where}: there is no joint '{name}' that mimics another")
+        new = {
+            b"joint": xml_attribute(other)[1:-1].encode("ascii", "xmlcharrefreplace"),
+            b"multiplier": _words([multiplier]),
+            b"offset": _words([offset]),
+        }
+        edits += _attribute_edits(_TAG.match(text, start)[0], start, new)
     return _spliced(text, edits)
 
 
@@ -183,7 +215,14 @@ def _pose_edits(tag: bytes, start: int, T: Array) -> list[_Edit]:
         new[b"xyz"] = _words(T[:3, 3])
     if off[:3, :3].max() > _UNCHANGED:
         new[b"rpy"] = _words(se3.to_rpy(T))
-    end = start + max((found.end() for found in at.values()), default=len(b"<origin"))
+    return _attribute_edits(tag, start, new)
+
+
+def _attribute_edits(tag: bytes, start: int, new: Mapping[bytes, bytes]) -> list[_Edit]:
+    """What gives attributes of a tag other values; those that it lacks come last."""
+    at = {found[1]: found for found in _ATTRIBUTE.finditer(tag)}
+    bare = len(re.match(rb"<[^\s/>]+", tag)[0])
+    end = start + max((found.end() for found in at.values()), default=bare)
     edits = []
     for key, words in new.items():
         if key in at:

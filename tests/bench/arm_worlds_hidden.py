@@ -155,6 +155,13 @@ def joint_scale(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
     return _turning(world, s, _each(rng, s) * s.joints)
 
 
+def joint_coupling(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    """A joint goes with the one before it."""
+    error, joint = np.zeros(s.joints.shape), rng.integers(1, s.joints.shape[1])
+    error[:, joint] = s.joints[:, joint - 1]
+    return _turning(world, s, error)
+
+
 def eccentricity(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
     turns = s.joints + rng.uniform(0, 2 * np.pi, s.joints.shape[1])
     return _turning(world, s, _each(rng, s) * np.sin(turns) * _revolute(world))
@@ -342,6 +349,7 @@ KINDS: Mapping[str, Kind] = {
     "payload offset": _kind(
         payload_offset, "arm_payload_moment", "arm_payload_offset", needs=("payload_kg",)
     ),
+    "coupling": _kind(joint_coupling, "arm_joint_coupling"),
 }
 
 

@@ -73,9 +73,10 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 }
 
 # The range zero is the rings' mean, which is in every model here; and rounding acts on no sensor.
-# What needs columns that these recordings lack is hidden in arms (`arm_effects.py`).
+# What needs columns that these recordings lack is hidden in arms (`arm_effects.py`), and no joint
+# of these follows another.
 _OF_LOADS = {"arm_payload_sag", "arm_payload_offset", "arm_payload_moment", "arm_torque_sag"}
-_NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT, *_OF_LOADS}
+_NOT_ALONE = {"range_offset", "range_quantisation", "arm_mimic_ratio", *DEFAULT, *_OF_LOADS}
 # What is drawn anew by chance at every stop has a bench of its own (`chance.py`).
 SINGLES = tuple(
     e.name
@@ -261,6 +262,8 @@ def _text(name: str, case: Case, folder: Path) -> str:
     if not effect.shape_name:
         return name
     grid = sorted(effect.shapes(stops_view(Source.open(folder / "twin"))))
+    if len(grid) == 1:  # looked for in the middle of the stops first
+        grid = [0.7 * grid[0], 1.3 * grid[0]]
     i = int(case.rng.integers(len(grid) - 1))
     whole = all(shape == int(shape) for shape in grid) and len(grid) > 10
     shape = grid[i] if whole else case.rng.uniform(grid[i], grid[i + 1])

@@ -75,6 +75,8 @@ def test_rows_that_have_nothing_in_common_are_not_out_of_step(shared):
         (lambda q: q[:, [0, 1, 2, 5, 4, 3]], "the columns of joint_4 and joint_6 were exchanged"),
         (lambda q: q + np.pi / 2 * np.eye(6)[2], "joint_3 read 90 deg less"),
         (lambda q: q - np.pi / 2 * np.eye(6)[1], "joint_2 read 90 deg more"),
+        (lambda q: q + q[:, [1]] * np.eye(6)[2], "joint_3 moved by joint_3 - joint_2"),
+        (lambda q: q - q[:, [4]] * np.eye(6)[5], "joint_6 moved by joint_6 + joint_5"),
     ],
 )
 def test_joints_read_otherwise_than_the_urdf_has_them(shared, change, said):
