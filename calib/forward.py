@@ -203,6 +203,7 @@ class Stops:
         edges: variable -> (e,) which of the E edges these are.
         joint_bases: variable -> (K or 1, j, P), the errors of the joints that it changes, per unit.
         axes: variable -> (j,) which of the J joints these are.
+        root_bases: variable -> (K or 1, 6, P), the twists by which the root stands elsewhere.
         root: variable of T_world_root.
         reference: variable of T_world_reference, or None where both are one frame.
         noise: variable of the joint errors (J,) of these stops alone, or None.
@@ -214,6 +215,7 @@ class Stops:
     edges: Mapping[str, np.ndarray]
     joint_bases: Mapping[str, np.ndarray]
     axes: Mapping[str, np.ndarray]
+    root_bases: Mapping[str, np.ndarray]
     root: str
     reference: str | None
     noise: str | None = None
@@ -225,7 +227,7 @@ class Stops:
     @cached_property
     def variables(self) -> tuple[str, ...]:
         """What places the rig in the world."""
-        return (self.root, *self.edge_bases, *self.joint_bases, *self.own[1:])
+        return (self.root, *self.root_bases, *self.edge_bases, *self.joint_bases, *self.own[1:])
 
     @cached_property
     def own(self) -> tuple[str, ...]:
@@ -239,6 +241,7 @@ class Stops:
             joints=self.joints[index],
             edge_bases=RowsOf(self.edge_bases, index),
             joint_bases=RowsOf(self.joint_bases, index),
+            root_bases=RowsOf(self.root_bases, index),
             root=root,
         )
 
@@ -254,6 +257,7 @@ class Stops:
             edges=first.edges,
             joint_bases=stacked([s.joint_bases for s in stops], counts),
             axes=first.axes,
+            root_bases=stacked([s.root_bases for s in stops], counts),
             root=ROOT,
             reference=first.reference,
             noise=None if first.noise is None else NOISE,
@@ -291,12 +295,19 @@ class Stops:
         return Placed(placed.Ts_root_frame, BySite(sites, parts, own))
 
     def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
-        """T_world_frame = T_world_root @ T_root_frame."""
+        """T_world_frame = T_world_root @ exp(effects of the root) @ T_root_frame."""
         inner = self.in_root(frame, values, derivatives)
-        T = values[self.root] @ inner.T
+        T_stood_frame, d = inner.T, inner.d
+        if self.root_bases:
+            twists = sum(basis @ values[name] for name, basis in self.root_bases.items())
+            T_stood_frame = se3.exp(twists) @ inner.T
+        T = values[self.root] @ T_stood_frame
         if not derivatives:
             return Placed(T, {})
-        return Placed(T, inner.d.beside({self.root: se3.adjoint(se3.inverse(inner.T))}))
+        if self.root_bases:
+            by = se3.adjoint(se3.inverse(inner.T)) @ se3.right_jacobian(twists)
+            d = d.at_site(Site.ROOT, by, self.root_bases)
+        return Placed(T, d.beside({self.root: se3.adjoint(se3.inverse(T_stood_frame))}))
 
     def in_reference(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_reference_frame = inverse(T_world_reference) @ T_world_frame."""
@@ -354,6 +365,7 @@ def place(
     view = View(rig, len(joints), columns, joints)
     edge_bases, edges = _acting(terms, Site.EDGE, view)
     joint_bases, axes = _acting(terms, Site.JOINTS, view)
+    of_root = (t for t in terms if t.effect.site is Site.ROOT and not t.effect.widens)
     return Stops(
         rig=rig,
         joints=joints,
@@ -361,6 +373,7 @@ def place(
         edges=edges,
         joint_bases=joint_bases,
         axes=axes,
+        root_bases={t.variable: t.basis(view) for t in of_root},
         root=root,
         reference=reference,
     )

@@ -1,7 +1,7 @@
 """What an effect is: one way the hardware lies, as a site and a basis.
 
 Instruments (BEAM, TRACKER) add to the truth, ``measured = true + basis(view) @ theta``; geometry
-(JOINTS, EDGE, TARGET, REFERENCE) adds to what encoder, URDF, CAD or mesh say,
+(JOINTS, EDGE, ROOT, TARGET, REFERENCE) adds to what encoder, URDF, CAD or mesh say,
 ``true = nominal + basis(view) @ theta``. ``theta = 0`` switches an effect off.
 """
 
@@ -33,6 +33,7 @@ class Site(Enum):
     BEAM = "beam"  # (3,) range m, azimuth rad, elevation rad; a row per point
     JOINTS = "joints"  # (J,) rad or m, what each encoder reports; a row per stop
     EDGE = "edge"  # (E, 6) twist of every edge of the frame tree; a row per stop
+    ROOT = "root"  # (6,) twist of the rig's root from where it stood; a row per stop
     TRACKER = "tracker"  # (B, 6) twist of every tracked body as seen; a row per stop. Of what is
     # `of_volume` also (2, 6), of the lower and the upper marker of targets; a row per target
     TARGET = "target"  # (3,) m, sphere centre on its rod, tracker frame; a row per target
@@ -142,7 +143,7 @@ class Effect(ABC):
             slips once may slip again, and a gear may err in more than one order.
         finer: how many shapes are tried between the two of a grid beside the best one.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
-        joint_kind: "revolute" or "prismatic" of an effect that is about such joints alone.
+        joint_kind: "revolute", "prismatic" or "mimic" of an effect that is about such joints alone.
         needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
         needs_standing: True of one about rigs that stand still over several stops.
         needs_masses: True of one that the weight of an arm's links makes.

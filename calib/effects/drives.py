@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
@@ -66,6 +68,7 @@ class ArmMimicRatio(Effect):
     """A joint that follows another goes further, or less far, than its URDF's multiplier says."""
 
     name = "arm_mimic_ratio"
+    joint_kind = "mimic"
     site = Site.EDGE
     unit = "1"
     formula = "q of a joint that mimics = (multiplier + dm) * reported + offset"
@@ -199,7 +202,8 @@ class ArmJointLag(ArmBacklash):
     """A joint is read before it has come to rest. Where it rests is off its reading by a share of
     the distance that it went.
 
-    The share depends on how long the arm waits before it is read; here each joint has one.
+    The share depends on how long the arm waits before it is read; here each joint has one, as where
+    the arm always waits as long.
     """
 
     name = "arm_joint_lag"
@@ -211,6 +215,43 @@ class ArmJointLag(ArmBacklash):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(Param.of_joint(joint, "1", 0.0005) for joint in rig.joint_names)
+
+
+class ArmJointLagDecay(ArmJointLag):
+    """A joint is read before it has come to rest, and is the nearer to it the longer the arm has
+    waited since the stop before.
+
+    Where the arm waits alike before all readings this is `ArmJointLag`.
+    """
+
+    name = "arm_joint_lag_decay"
+    formula = (
+        "q_i = reported_i + k_i * (how far joint i went) * exp(-wait / tau), "
+        "wait since the stop before"
+    )
+    typical = "0.1 to 2 percent of the distance as the arm stops, tau 0.3 to 5 s, size assumed"
+    confounded_with = ("arm_joint_lag", "arm_backlash", "arm_joint_scale")
+    covariates = ("joints", "wait_s", "time_s")
+    shape_name, shape = "tau_s", 1.0
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        return tuple(replace(param, sigma=0.01) for param in super().params(rig))
+
+    def shapes(self, stops: View) -> tuple[float, ...]:
+        """A grid from where what is left falls by a fifth, from the shortest wait to the longest, to
+        where a thousandth is left after the shortest."""
+        if not self.params(stops.rig) or "wait_s" not in stops.columns:
+            return ()
+        waits = stops["wait_s"][stops["wait_s"] > 0]
+        if not len(waits):
+            return ()
+        least_s, most_s = waits.min() / -np.log(0.001), np.ptp(waits) / -np.log(0.8)
+        taus = np.geomspace(least_s, most_s, 6) if most_s > least_s else ()
+        return tuple(float(f"{tau:.3g}") for tau in taus)
+
+    def basis(self, view: View) -> np.ndarray:
+        left = np.exp(-view["wait_s"] / self.shape)
+        return left[:, None, None] * super().basis(view)
 
 
 def _coupled(rig: Rig) -> tuple[tuple[str, str], ...]:
@@ -231,8 +272,7 @@ def _coupled(rig: Rig) -> tuple[tuple[str, str], ...]:
 
 def _followers(rig: Rig) -> list[Edge]:
     """The edges of joints that follow one that is read."""
-    edges = [e for e in rig.tree.edges if e.joint is not None and not e.joint.leads]
-    return [edge for edge in edges if edge.joint.name not in rig.passive]
+    return [edge for edge in rig.followers if edge.joint.name not in rig.passive]
 
 
 def _over(unit: str, other: str) -> str:

@@ -7,7 +7,6 @@ import numpy as np
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import Creeps, Settles, Slips
 from calib.rig import Rig
-from chains import se3
 
 DOF = ("rx", "ry", "rz", "tx", "ty", "tz")
 
@@ -124,35 +123,25 @@ class LidarSlip(MountSlip):
 
 class StandSlip(MountSlip):
     """What the rig stands on moves once. A tripod is kicked, or a wheel gives way, where the rig is
-    taken to stand still over several stops; it stays there."""
+    taken to stand still over several stops; it stays there.
+
+    A LiDAR in its room, or a level, tells it from a move of the tracker.
+    """
 
     name = "stand_slip"
-    needs_lidar = needs_standing = True
+    site = Site.ROOT
+    needs_standing = True
     formula = "T_world_root = T_stood exp(theta) where t > t*, t since the first stop"
     typical = "0.5 to 50 mm, 0.5 to 20 mrad, size assumed"
     confounded_with = ("tracker_slip", "arm_joint_slip", "mount_slip")
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        """None where every stop has a place of its own, and where an instrument is the root."""
-        if rig.moves == "stop" or not rig.lidar:
-            return ()
-        bodies = rig.tracker.bodies if rig.tracker else ()
-        levels = rig.levels.frames if rig.levels else ()
-        hang = all(rig.tree.path(frame) for frame in (rig.lidar_frame, *bodies, *levels))
-        return self.moves() if hang else ()
-
-    def edge(self, rig: Rig) -> None:
-        """No single one."""
+        """None where every stop has a place of its own."""
+        shows = rig.lidar or (rig.levels and rig.levels.frames)
+        return self.moves() if rig.moves != "stop" and shows else ()
 
     def moved(self, view: View, by: np.ndarray) -> np.ndarray:
-        """All that hangs from the root moves with it, each edge in its own axes."""
-        tree = view.rig.tree
-        basis = np.zeros((len(by), len(tree.edges), 6, 6))
-        for e, edge in enumerate(tree.edges):
-            if edge.parent == tree.root:
-                back = se3.adjoint(se3.inverse(edge.T_parent_child))
-                basis[:, e] = by[:, None, None] * back
-        return basis
+        return by[:, None, None] * np.eye(6)
 
 
 class StandCreep(Creeps, StandSlip):

@@ -30,6 +30,7 @@ WHERE = {
     Site.BEAM: "the LiDAR's beams",
     Site.JOINTS: "the arm's joints",
     Site.EDGE: "links and frames",
+    Site.ROOT: "where the rig stands",
     Site.TRACKER: "what the tracker says",
     Site.TARGET: "the targets",
     Site.REFERENCE: "the reference",
@@ -86,11 +87,11 @@ class FittedRig:
                 continue
             left, rates = basis @ self.part.effects[name].estimate, {}
             size = np.abs(left).max()
-            for e, edge in enumerate(tree.edges):
-                if edge.joint is not None and not edge.joint.leads:
-                    q = view.joints[:, self.rig.joint_names.index(edge.joint.name)]
-                    rates[edge.name] = float(q @ left[:, e] @ edge.joint.along / (q @ q))
-                    left[:, e] -= rates[edge.name] * np.outer(q, edge.joint.along)
+            for edge in self.rig.followers:
+                e = tree.edge_names.index(edge.name)
+                q = view.joints[:, self.rig.joint_names.index(edge.joint.name)]
+                rates[edge.name] = float(q @ left[:, e] @ edge.joint.along / (q @ q))
+                left[:, e] -= rates[edge.name] * np.outer(q, edge.joint.along)
             if np.abs(left).max() <= _ROUNDING * size:
                 out[name] = rates
         return out

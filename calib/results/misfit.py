@@ -30,7 +30,7 @@ UNCHECKED = 0.01
 XYZ = ("x", "y", "z")
 SEEN_BY = ("tracker", "level")  # instruments that see bodies at stops
 # What says how the rig is built.
-GEOMETRY_SITES = Site.EDGE, Site.JOINTS, Site.TARGET, Site.REFERENCE
+GEOMETRY_SITES = Site.EDGE, Site.ROOT, Site.JOINTS, Site.TARGET, Site.REFERENCE
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -24,10 +24,10 @@ def stop_columns(
 
     Each joint by its name as reported, rad or m; ``torques`` (K, J), N m or N, where any column
     ``<joint>.torque`` was recorded; ``payload_kg`` of the first tip where ``<tip>.payload_kg`` of
-    any was; and, where the times are known: ``time_s``;
-    ``elapsed_s`` since the first stop; ``travel.<joint>``, how far a joint went since the stop
-    before, rad or m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first both are 0: nothing
-    is known of it.
+    any was; and, where the times are known: ``time_s``; ``elapsed_s`` since the first stop;
+    ``wait_s`` since the stop before; ``travel.<joint>``, how far a joint went since then, rad or m;
+    ``moved.<joint>``, which way: -1, 0 or 1. Of the first stop these three are 0: nothing is known
+    of it.
 
     Args:
         rig: whose joints they are.
@@ -47,9 +47,11 @@ def stop_columns(
     if not np.isfinite(time_s).all():
         return columns
     order = np.argsort(time_s, kind="stable")
-    travel = np.zeros(np.shape(joints))
+    travel, wait_s = np.zeros(np.shape(joints)), np.zeros(len(joints))
     travel[order[1:]] = np.diff(joints[order], axis=0)
-    columns |= {"time_s": time_s, "elapsed_s": time_s - time_s.min(initial=np.inf)}
+    wait_s[order[1:]] = np.diff(time_s[order])
+    elapsed_s = time_s - time_s.min(initial=np.inf)
+    columns |= {"time_s": time_s, "elapsed_s": elapsed_s, "wait_s": wait_s}
     for name, went in zip(rig.joint_names, travel.T, strict=True):
         columns |= {f"travel.{name}": went, f"moved.{name}": np.sign(went)}
     return columns
@@ -83,15 +85,39 @@ def recorded_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]
 
 def up_in_root(rig: Rig, recording: RecordedStops) -> np.ndarray:
     """Unit vectors (K, 3) that point up in the root's frame, as levels say there on average, the
-    chain as on paper; where none was read, as at all other stops."""
+    chain as on paper; where none was read, as at all other stops. Without levels, as follows from
+    where up is known to be in the tracker's frame."""
     said = [
         np.matvec(rig.tree.transform(frame, recording.joints)[:, :3, :3], felt)
         for frame, felt in recording.levels.items()
     ]
+    if not said and rig.levels.up and rig.tracker:
+        said = [in_root(rig, recording, rig.levels.up)]
     up = np.nansum([np.full((len(recording.stops), 3), np.nan), *said], axis=0)
     elsewhere = up.sum(axis=0) if up.any() else UPRIGHT
     up = np.where(up.any(axis=1, keepdims=True), up, elsewhere)
     return up / np.linalg.norm(up, axis=1, keepdims=True)
+
+
+def in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
+    """Unit vectors (K, 3) in the root's frame that point where a direction (3,) does in the
+    tracker's, the rig lying as the body with the fewest joints before it says, on median for as
+    long as it stands still; NaN where that is not seen."""
+    tracked, bodies = tracked_poses(rig, recording), rig.tracker.bodies
+    read = [b for b in bodies if set(rig.passive).isdisjoint(rig.joints_to(b))]
+    read = [b for b in read if np.isfinite(tracked[:, bodies.index(b), 0, 0]).any()]
+    if not read:
+        return np.full((len(tracked), 3), np.nan)
+    body = min(read, key=lambda b: len(rig.joints_to(b)))
+    R_world_body = tracked[:, bodies.index(body), :3, :3]
+    R_root_body = rig.tree.transform(body, recording.joints)[:, :3, :3]
+    there = np.matvec(R_root_body @ R_world_body.mT, np.array(direction, float))
+    places = recording.location if rig.moves == "location" else np.zeros(len(there), int)
+    for place in np.unique(places) if rig.moves != "stop" else ():
+        some = there[places == place]
+        if np.isfinite(some).any():
+            there[places == place] = np.nanmedian(some, axis=0)
+    return there / np.linalg.norm(there, axis=1, keepdims=True)
 
 
 def tracked_poses(rig: Rig, recording: RecordedStops) -> np.ndarray:

@@ -39,8 +39,8 @@ class Levels:
     """Accelerometers: the frames that have one, its noise, and what is known of up in the world."""
 
     frames: tuple[str, ...]
-    sigma_rad: float
-    """Of a direction, about either axis across it."""
+    sigma_rad: float | None
+    """Of a direction, about either axis across it; None without frames."""
     sigma_zero_rad: float | None = None
     """Of what an axis reads where it feels nothing, over 1 g; None where that counts as none."""
     up: tuple[float, float, float] | None = None
@@ -160,6 +160,11 @@ class Rig:
     def joint_units(self) -> dict[str, str]:
         """The unit of every joint, by its name."""
         return {joint.name: joint.unit for joint in self.joints}
+
+    @property
+    def followers(self) -> list[Edge]:
+        """Edges of joints that follow another."""
+        return [e for e in self.tree.edges if e.joint is not None and not e.joint.leads]
 
     @property
     def turning(self) -> frozenset[str]:

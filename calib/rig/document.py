@@ -115,8 +115,8 @@ class TrackerDocument(Document):
 class LevelsDocument(Document):
     """Frames with an accelerometer, and what is known beforehand of up in the world."""
 
-    frames: Names
-    sigma_rad: Sigma
+    frames: Annotated[tuple[str, ...], pydantic.AfterValidator(_once_each)] = ()
+    sigma_rad: Sigma | None = None
     sigma_zero_rad: Sigma | None = None
     up: tuple[Number, Number, Number] | None = None
     sigma_up_rad: Sigma | None = None
@@ -127,6 +127,10 @@ class LevelsDocument(Document):
             raise ValueError("up and sigma_up_rad go together; give both, or neither")
         if self.up is not None and not any(self.up):
             raise ValueError("up is (0, 0, 0), which points nowhere; of a level world it is 0 0 1")
+        if not self.frames and self.up is None:
+            raise ValueError("it has neither frames nor up; give one of them, or both")
+        if self.frames and self.sigma_rad is None:
+            raise ValueError("frames have no sigma_rad; say how sure a direction is")
         return self
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig import Rig
-from calib.rig.columns import PAYLOAD, up_in_root
+from calib.rig.columns import PAYLOAD, in_root, up_in_root
 from calib.rig.suspect import listed
+from chains.arm import UPRIGHT
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 from sensors.stops import Targets, level_columns, undeclared_levels
@@ -37,6 +38,8 @@ STOPS_A_STAND_IN, BEYOND_REAL = 10, 100.0
 ANOTHER_UNIT = 2.0  # times as far as measured: of feet for metres 3.3, were the scan well placed
 FEWEST_IN_ORDER = 6  # rows: in any order, two of so many are out of it in 1 of 48 draws
 HEAD_DOWN = -0.5  # of the root's z along what points up: of a rig on a wall it is about 0
+LEANS_RAD = 0.1  # its sine: of what weights do, as much is taken to act across or not at all
+OFTEN_UP = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)  # in the frames of trackers
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
 FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
@@ -141,6 +144,7 @@ def odd_numbers(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     yield from odd_columns(recording)
     yield from odd_payloads(rig, recording)
     yield from _head_down(rig, recording)
+    yield from _leans(rig, recording)
 
 
 def odd_rig(rig: Rig) -> Iterator[str]:
@@ -285,6 +289,23 @@ def _head_down(rig: Rig, recording: RecordedStops) -> Iterator[str]:
             f"levels say that z of '{rig.tree.root}' points down; at rest they are to read 1 g "
             "along what points up. Does the rig hang from a ceiling? Else turn the signs of .ax, "
             ".ay and .az"
+        )
+
+
+def _leans(rig: Rig, recording: RecordedStops) -> Iterator[str]:
+    """An arm that stands askew in the tracker's frame, of which nothing says where up is."""
+    if rig.levels or not rig.masses or rig.tracker is None:
+        return
+    ups = np.stack([in_root(rig, recording, up) for up in OFTEN_UP], axis=1)
+    ups = ups[np.isfinite(ups[:, 0, 0])].mean(axis=0) if np.isfinite(ups).any() else UPRIGHT[None]
+    lean_rad = np.arccos(np.clip(ups[:, 2] / np.linalg.norm(ups, axis=1), -1.0, 1.0)).min()
+    if lean_rad > LEANS_RAD:
+        root = rig.tree.root
+        yield (
+            f"z of '{root}' leans by {np.degrees(lean_rad):.0f} deg from z and y of the tracker's "
+            f"frame. The weight of the arm's links is taken to pull along z of '{root}'; if it "
+            "does not, say where up is in the tracker's frame, as by levels: {up: [0, 0, 1], "
+            "sigma_up_rad: 0.005} in rig.yaml, or put a level on the rig"
         )
 
 

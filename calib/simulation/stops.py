@@ -200,12 +200,14 @@ class World:
         plan: the stops.
         joints: (K, J) true joints.
         twists: (K or 1, E, 6) by which the frame tree's edges truly differ from paper.
+        moved: (K or 1, 6) by which the root truly stands elsewhere than where it is said to.
     """
 
     truth: Truth
     plan: SimulatedStops
     joints: np.ndarray
     twists: np.ndarray
+    moved: np.ndarray
 
     @classmethod
     def of(
@@ -219,7 +221,9 @@ class World:
         shape = stops.joints.shape
         jitter = noise * rig.sigma_joint_rad * rng.standard_normal(shape)
         joints = stops.joints + jitter + truth.error(Site.JOINTS, view, shape[1:])
-        return cls(truth, stops, joints, truth.error(Site.EDGE, view, (len(rig.tree.edges), 6)))
+        twists = truth.error(Site.EDGE, view, (len(rig.tree.edges), 6))
+        moved = truth.error(Site.ROOT, view, (6,))
+        return cls(truth=truth, plan=stops, joints=joints, twists=twists, moved=moved)
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
@@ -233,7 +237,7 @@ class World:
     def in_faro(self, frame: str) -> np.ndarray:
         """True T_faro_frame (K, 4, 4)."""
         placed = self.truth.rig.tree.place(frame, self.joints, self.twists)
-        return self.plan.Ts_faro_root @ placed.Ts_root_frame
+        return self.plan.Ts_faro_root @ se3.exp(self.moved) @ placed.Ts_root_frame
 
     def tracked(self, noise: float, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """What the tracker said: body -> T_opti_body (K, 4, 4), with its effects and its noise."""

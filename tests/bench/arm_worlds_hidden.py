@@ -187,6 +187,13 @@ def lag(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
     return _turning(world, s, np.abs(_each(rng, s)) * went)
 
 
+def lag_decay(world: ArmWorld, s: Session, rng: np.random.Generator) -> Seen:
+    """What is left of a way falls with the time since the stop before, to a third in 3 s."""
+    went = np.diff(s.joints, axis=0, prepend=s.joints[:1])
+    left = np.exp(-np.diff(s.time_s, prepend=0.0) / 3.0)[:, None]
+    return _turning(world, s, np.abs(_each(rng, s)) * left * went)
+
+
 def _one_joint(s: Session, rng: np.random.Generator) -> np.ndarray:
     return np.eye(s.joints.shape[1])[rng.integers(s.joints.shape[1])]
 
@@ -350,6 +357,7 @@ KINDS: Mapping[str, Kind] = {
         payload_offset, "arm_payload_moment", "arm_payload_offset", needs=("payload_kg",)
     ),
     "coupling": _kind(joint_coupling, "arm_joint_coupling"),
+    "lag decay": _kind(lag_decay, "arm_joint_lag_decay"),
 }
 
 

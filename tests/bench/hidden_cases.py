@@ -73,16 +73,16 @@ UNKNOWN: dict[str, tuple[frozenset[str], dict[str, Any]]] = {
 }
 
 # The range zero is the rings' mean, which is in every model here; and rounding acts on no sensor.
-# What needs columns that these recordings lack is hidden in arms (`arm_effects.py`), and no joint
-# of these follows another.
+# What needs columns that these recordings lack is hidden in arms (`arm_effects.py`).
 _OF_LOADS = {"arm_payload_sag", "arm_payload_offset", "arm_payload_moment", "arm_torque_sag"}
-_NOT_ALONE = {"range_offset", "range_quantisation", "arm_mimic_ratio", *DEFAULT, *_OF_LOADS}
+_NOT_ALONE = {"range_offset", "range_quantisation", *DEFAULT, *_OF_LOADS}
 # What is drawn anew by chance at every stop has a bench of its own (`chance.py`).
 SINGLES = tuple(
     e.name
     for e in CATALOGUE
     if e.site is not Site.NOISE and not e.by_chance and e.name not in _NOT_ALONE
-    if e.joint_kind != "prismatic" and not e.needs_standing  # no rig of these has or does so
+    # No rig of these has or does so.
+    if e.joint_kind not in ("prismatic", "mimic") and not e.needs_standing
 )
 # Their parameters have one unit, so that a size at which they are found means something.
 OF_ONE_UNIT = tuple(n for n in SINGLES if not find(n).shape_name and "creep" not in n)

@@ -36,7 +36,7 @@ def views(tmp_path_factory):
     targets = View(source.rig, 4, {"target": np.arange(4)}, np.zeros((1, 0)))
     at = {
         **dict.fromkeys((Site.BEAM, Site.REFERENCE, Site.NOISE), beams),
-        **dict.fromkeys((Site.JOINTS, Site.EDGE, Site.TRACKER), stops),
+        **dict.fromkeys((Site.JOINTS, Site.EDGE, Site.ROOT, Site.TRACKER), stops),
         Site.TARGET: targets,
     }
 
@@ -52,6 +52,7 @@ def shape(site, rig):
         Site.BEAM: (3,),
         Site.JOINTS: (len(rig.joint_names),),
         Site.EDGE: (len(rig.tree.edges), 6),
+        Site.ROOT: (6,),
         Site.TRACKER: (len(rig.tracker.bodies), 6),
         Site.TARGET: (3,),
         Site.REFERENCE: (3,),
@@ -61,8 +62,8 @@ def shape(site, rig):
 
 # Of edges, what has unknowns for each joint.
 OF_JOINTS = ("arm_link_length", "arm_axis_tilt", "arm_geometry", "arm_link_bending")
-# The rig of these views has no rails: see test_rail.
-SHAPED = [effect for effect in effects.CATALOGUE if effect.joint_kind != "prismatic"]
+# The rig of these views has no rails, and no joint follows another: see test_rail, test_coupled.
+SHAPED = [e for e in effects.CATALOGUE if e.joint_kind not in ("prismatic", "mimic")]
 
 
 @pytest.mark.parametrize("effect", SHAPED, ids=lambda e: e.name)
@@ -120,7 +121,7 @@ def test_the_catalogue_says_what_an_effect_is(effect, views):
     assert set(effect.covariates) <= {*view.columns, "joints"}
     # It looks at nothing else.
     columns = {name: view.columns[name] for name in effect.covariates if name != "joints"}
-    if "time_s" in columns:
+    if "time_s" in columns:  # what follows from it
         columns |= {n: c for n, c in view.columns.items() if n.startswith(("moved.", "travel."))}
     # What says which row it is of.
     own = {Site.REFERENCE: "normal", Site.TARGET: "target"}.get(effect.site)
@@ -150,12 +151,12 @@ def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     lidar, arm = bare
     unknown = {"label_range_offset", "range_quantisation"}
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
-    assert bool(effect.params(lidar)) == of_lidar
+    assert bool(effect.params(lidar)) == (of_lidar or effect.needs_standing)
     unknown = {"arm_gravity_sag", "arm_link_bending", "base_flex", "mount_bending"}
     unknown |= {"mount_slip", "mount_creep", "mount_settle", "lidar_slip"}
     unknown |= {"stop_pose_scatter"}  # of a LiDAR
+    unknown |= {"arm_mimic_ratio"}  # no joint follows another
     of_arm = effect.site in (Site.JOINTS, Site.EDGE) and effect.name not in unknown
-    of_arm &= not effect.needs_standing  # of a LiDAR, too
     assert bool(effect.params(arm)) == of_arm
 
 

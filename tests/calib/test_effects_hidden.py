@@ -20,7 +20,8 @@ from .simulated import made, off_mesh
 DITHERED = "range_quantisation"
 # Not those that only widen what rows may be off: they are in `test_components`.
 SHOWN = [e for e in CATALOGUE if e.site is not Site.NOISE and not e.widens]
-SHOWN = [e.name for e in SHOWN if e.name != DITHERED and e.joint_kind != "prismatic"]  # test_rail
+OF_OTHER_ARMS = ("prismatic", "mimic")  # see test_rail and test_coupled
+SHOWN = [e.name for e in SHOWN if e.name != DITHERED and e.joint_kind not in OF_OTHER_ARMS]
 # Effects that trackers and targets alone can show.
 UNSEEN_BY_BEAMS = {e.name for e in CATALOGUE if e.site in (Site.TRACKER, Site.TARGET)}
 # Their sigma is a maker's tolerance, not what is left after his calibration.

@@ -33,7 +33,7 @@ WIDE_ENOUGH = 1.5  # largest over smallest value, from which powers differ from 
 LEAST_SHARE = 0.005  # of the beams that a class must have
 # Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
 # room is in range, incidence and label.
-NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s"}
+NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s", "wait_s"}
 NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal", "point_m"}
 
 

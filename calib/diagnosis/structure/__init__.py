@@ -128,10 +128,11 @@ def structure(sources: Sequence[Source], sample: Mapping[str, np.ndarray]) -> li
 def formulas_of(slip: MountSlip, rig: Rig) -> tuple[tuple[str, Param], ...]:
     """Where formulas act that move what a slip moves, and for each its parameter."""
     moves = slip.params(rig)
+    if slip.site is Site.ROOT:  # no formula moves all that hangs there
+        return ()
     if slip.site is Site.EDGE and moves:
-        if (edge := slip.edge(rig)) is None:
-            return ()
-        return tuple((f"{rig.tree.edge_names[edge]}.{move.name}", move) for move in moves)
+        edge = rig.tree.edge_names[slip.edge(rig)]
+        return tuple((f"{edge}.{move.name}", move) for move in moves)
     # The tracker turns bodies about its own axes, and a formula acts in those of each body.
     return tuple((f"tracker:{move.name}", move) for move in moves if "." in move.name)
 

@@ -53,6 +53,8 @@ def errors(effect: Effect, view: View, basis: Basis, settings: np.ndarray) -> li
         by_twist = rig.tree.place(frame, view.joints).d_twist.reshape(len(view.joints), 6, -1)
         twist = by_twist @ error.reshape(len(error), by_twist.shape[2], -1)
         return _moved(f"{frame} moves", twist[:, None])
+    if site is Site.ROOT:
+        return _moved("the rig moves", error[:, None])
     return _moved("body moves", error)
 
 
