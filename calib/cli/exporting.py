@@ -31,7 +31,7 @@ def export(
         typer.Option(
             "--format",
             help="yaml, urdf, dh, ros2, autoware, kalibr, rings, hesai, ouster, tree, latex, "
-            "markdown; all that have anything to hold if not given.",
+            "markdown, with commas; all that have anything to hold if not given.",
         ),
     ] = None,
     trust: Trust = None,
@@ -40,12 +40,13 @@ def export(
 ) -> None:
     """Write the result as YAML, URDF, ROS 2, ring tables, ..."""
     from calib.blunders.told import whole
+    from calib.effects import split
     from calib.exporters import export as write
     from calib.runs.reopen import effects_that_may_run
     from calib.runs.run import Run
 
     opened = Run.open(run, trust or ())
-    done = write(opened, out, formats or [], force)
+    done = write(opened, out, split(formats or ()), force)
     document = {
         "warnings": opened.before_use,
         "files": [str(file) for file in done.files],

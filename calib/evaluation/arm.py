@@ -43,11 +43,16 @@ class Command:
         joints: (K, J) rad or m, as the encoders report them.
         off_m, off_rad: (K,) what is left; next to nothing but for arms of less than six joints,
             and where an arm is stretched.
+        went: (K,) how far the joint that goes furthest goes from those asked for, rad or m. Next to
+            where two axes lie in line, a small error of the tip takes large turns of both.
+        within: (K,) whether all joints are within the limits of the URDF.
     """
 
     joints: np.ndarray
     off_m: np.ndarray
     off_rad: np.ndarray
+    went: np.ndarray
+    within: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -166,7 +171,14 @@ class Arm:
         far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
         solve(np.flatnonzero(far), command, STRETCHED_STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
-        return Command(joints=command, off_m=shifted, off_rad=turned / self._length_m)
+        lower, upper = np.array([[j.lower, j.upper] for j in self.rig.joints]).reshape(-1, 2).T
+        return Command(
+            joints=command,
+            off_m=shifted,
+            off_rad=turned / self._length_m,
+            went=np.abs(command - near).max(axis=1, initial=0.0),
+            within=((command >= lower) & (command <= upper)).all(axis=1),
+        )
 
     def _solve(
         self, wanted: np.ndarray, near: np.ndarray, columns: Columns, steps: int

@@ -86,6 +86,11 @@ def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
     wanted = arm.drawn.place(joints)
     there = in_the_graph(source, known, values, command.joints, {}, "arm_base", "tool")
     off = se3.log(se3.inverse(wanted) @ there)
+    np.testing.assert_array_equal(command.went, np.abs(command.joints - joints).max(axis=1))
+    limits = np.array([[joint.lower, joint.upper] for joint in source.rig.joints]).T
+    beyond = (command.joints < limits[0]) | (command.joints > limits[1])
+    np.testing.assert_array_equal(command.within, ~beyond.any(axis=1))
+    assert not command.within.all() and command.within.mean() > 0.5
     close = command.off_m < 1e-7
     # But for poses in which the arm is stretched or its wrist straight: it cannot go on that way.
     J = arm.drawn.axes(joints).jacobian()

@@ -50,7 +50,7 @@ def test_people_are_told_the_same(rigcal):
 
 
 def test_formats_are_chosen(rigcal, folder):
-    code, out, _ = rigcal("export", "run", "-o", "few", "--format", "tree", "--format", "yaml")
+    code, out, _ = rigcal("export", "run", "-o", "few", "--format", "tree,yaml")
     assert code == 0 and out.startswith("wrote few/tree.svg\nwrote few/extrinsics.yaml\n")
     assert {file.name for file in (folder / "few").iterdir()} == {"tree.svg", "extrinsics.yaml"}
     assert yaml.safe_load((folder / "few/extrinsics.yaml").read_text())["frames"]
