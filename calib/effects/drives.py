@@ -238,8 +238,8 @@ class ArmJointLagDecay(ArmJointLag):
         return tuple(replace(param, sigma=0.01) for param in super().params(rig))
 
     def shapes(self, stops: View) -> tuple[float, ...]:
-        """A grid from where what is left falls by a fifth, from the shortest wait to the longest, to
-        where a thousandth is left after the shortest."""
+        """A grid: from where a thousandth is left after the shortest wait, to where a fifth less is
+        left after the longest."""
         if not self.params(stops.rig) or "wait_s" not in stops.columns:
             return ()
         waits = stops["wait_s"][stops["wait_s"] > 0]
