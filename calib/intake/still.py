@@ -15,10 +15,12 @@ from sensors.readers.base import Track
 
 STILL_WINDOW_S = 0.25  # rates are smoothed over it: an arm takes longer to move
 REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
-FACTOR = 4.0  # above the rate at rest, and it is no noise
+FACTOR = 3.0  # times the rms rate at rest, which noise of one component exceeds 1 time in 400
+WILD = 2.0  # times that again, and it is no noise, however short
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
 SETTLE_S = 0.3  # cut from both ends of a hold
-MIN_HOLD_S = 1.0  # ten turns of a LiDAR, by which its noise averages to a third
+# Ten turns of a LiDAR, by which its noise averages to a third; also what the rms rate is taken over.
+MIN_HOLD_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ def find_holds(
 ) -> Holds:
     """Find when nothing moves: no joint, no tracked body, no gyro.
 
-    A rate is small if it stays below four times its size at rest, which is that of the quietest
+    A rate is small if it stays below three times its rms at rest, which is that of the quietest
     tenth of the log, held between 3 and 50 mrad/s (mm/s); `threshold` replaces it. A log that
     does not see something, neither makes nor breaks a hold, and holds are cut short by 0.3 s at
     both ends, in which things settle.
@@ -60,8 +62,8 @@ def find_holds(
         )
     still, said = [], []
     for time_s, rate, name in rates:
-        limit = threshold if threshold is not None else learned(rate)
-        still.append(_spans(time_s, rate < limit, ~np.isfinite(rate)))
+        limit = threshold if threshold is not None else learned(time_s, rate)
+        still.append(_spans(time_s, _at_rest(time_s, rate, limit), ~np.isfinite(rate)))
         said.append(f"holds: {name} is at rest below {1e3 * limit:.1f} mrad/s or mm/s")
     together = still[0]
     for other in still[1:]:
@@ -111,10 +113,16 @@ def _broken(own: Array, spans: Array, name: str, min_hold_s: float) -> list[str]
     ]
 
 
-def learned(rate: Array) -> float:
-    """The rate below which something is at rest, from how fast it is when it is quietest."""
-    known = rate[np.isfinite(rate)]
-    return float(np.clip(FACTOR * np.quantile(known, REST_SHARE), SLOWEST, FASTEST))
+def learned(time_s: Array, rate: Array) -> float:
+    """The rate below which something is at rest, from its rms over the quietest of all windows as
+    long as a hold."""
+    known = np.isfinite(rate)
+    time_s, rate = time_s[known], rate[known]
+    first = np.searchsorted(time_s, time_s - MIN_HOLD_S / 2)
+    after = np.searchsorted(time_s, time_s + MIN_HOLD_S / 2, side="right")
+    squares = np.concatenate([[0.0], np.cumsum(np.square(rate))])
+    rms = np.sqrt((squares[after] - squares[first]) / (after - first))
+    return float(np.clip(FACTOR * np.quantile(rms, REST_SHARE), SLOWEST, FASTEST))
 
 
 def _fastest(track: Track, edges: Sequence[Edge]) -> tuple[Array, Array, str] | None:
@@ -133,6 +141,20 @@ def _unbiased(motion: Motion) -> Array:
     change = np.linalg.norm(np.diff(motion.rate, axis=0, append=motion.rate[-1:]), axis=1)
     quiet = change <= np.nanquantile(change, REST_SHARE)
     return motion.rate - np.nanmedian(motion.rate[quiet], axis=0)
+
+
+def _at_rest(time_s: Array, rate: Array, limit: float) -> Array:
+    """(N,) whether a rate is below a limit, or a little above it so shortly that nothing goes
+    further than it may in one window at rest, as where noise alone exceeds the limit."""
+    fast = np.concatenate([[False], rate >= limit, [False]]).astype(int)
+    starts, ends = np.flatnonzero(np.diff(fast) == 1), np.flatnonzero(np.diff(fast) == -1)
+    went = np.concatenate([[0.0], np.cumsum(np.nan_to_num(rate) * np.gradient(time_s))])
+    still = rate < limit
+    for start, end in zip(starts, ends, strict=True):
+        near = rate[start:end].max() < WILD * limit
+        if near and went[end] - went[start] < limit * STILL_WINDOW_S:
+            still[start:end] = True
+    return still
 
 
 def _spans(time_s: Array, still: Array, unknown: Array) -> Array:

@@ -1,5 +1,7 @@
 """Holds found in logs: where they truly are, whatever logged them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -53,6 +55,24 @@ def inside(found):
 @pytest.mark.parametrize("make", [joints, cup, gyro], ids=["joints", "tracker", "gyro"])
 def test_holds_are_where_nothing_moves(make):
     inside(find_holds([make()], ()).spans_s)
+
+
+@pytest.mark.parametrize("depth_m", [2e-4, 1e-3, 2e-3])
+def test_noise_alone_splits_no_hold(depth_m):
+    """A camera's poses scatter along its axis, hardly across: the rate comes near to 0 time and
+    again, and is many times that as often."""
+    seen = cup(noise_m=2e-5)
+    seen.values[:, 2] += depth_m * np.random.default_rng(4).normal(size=len(TIME_S))
+    few = replace(seen, time_s=seen.time_s[::4], values=seen.values[::4])
+    inside(find_holds([few], ()).spans_s)
+
+
+def test_a_wild_pose_is_in_no_hold():
+    seen = cup()
+    at = int(np.searchsorted(TIME_S, SPANS[2].mean()))
+    seen.values[at, :3] += 0.02
+    found = find_holds([seen], (), min_hold_s=0.5).spans_s
+    assert not any(start <= TIME_S[at] <= end for start, end in found)
 
 
 def test_all_that_moves_must_be_still():
