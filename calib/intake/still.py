@@ -19,7 +19,7 @@ FACTOR = 3.0  # times the rms rate at rest, which noise of one component exceeds
 WILD = 2.0  # times that again, and it is no noise, however short
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
 SETTLE_S = 0.3  # cut from both ends of a hold
-# Ten turns of a LiDAR, by which its noise averages to a third; also what the rms rate is taken over.
+# Ten turns of a LiDAR, by which its noise averages to a third; the rms rate is taken over it, too.
 MIN_HOLD_S = 1.0
 
 

@@ -18,6 +18,7 @@ from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.tracker import TrackedBody
 from calib.results.intervals import Intervals
+from calib.results.sigmas import TOLERATED
 from calib.rig import Rig
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -30,6 +31,10 @@ FAR_WORSE = 2.0
 # Of the span of what was measured, from which something lies beyond it: a choice, as any new pose
 # may lie a little beyond.
 BEYOND_SPAN = 0.1
+BEYOND_MODEL = (
+    "that is by what the model knows; of stops held out it is {:.2f} mm off, where {:.2f} mm is "
+    "expected"
+)
 TOLD_SHARE = 0.95  # of errors that lie below what is told
 
 
@@ -74,15 +79,21 @@ class Reach:
             f"known {self.anywhere_m / self.at_poses_m:.1f} times worse: add poses out there"
         )
 
-    def document(self) -> dict[str, Any]:
-        """As summary.json holds it."""
+    def document(self, summary: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """As summary.json, of a fit, holds it. Where stops held out are further off than they
+        should be, the model lacks something, and what is predicted does not hold that."""
+        told = [self.sentence, *([self.warning] if self.is_small else [])]
+        rms_mm = summary["rms_mm"] if summary else {}
+        held_out, expected = rms_mm.get("held_out"), rms_mm.get("noise_floor")
+        if held_out and expected and held_out > TOLERATED * expected:
+            told.insert(1, BEYOND_MODEL.format(held_out, expected))
         return {
             "body": self.body,
             "at_poses": 1e3 * self.at_poses_m,
             "anywhere": 1e3 * self.anywhere_m,
             "box": 1e3 * self.box_m,
             "box_share": self.box_share,
-            "told": [self.sentence, *([self.warning] if self.is_small else [])],
+            "told": told,
         }
 
 

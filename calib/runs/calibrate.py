@@ -279,7 +279,7 @@ def _fit(
     summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
     summary |= {"intervals_wider_by": calibration.document(solution.names)}
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
-    summary["predicted_mm"] = reached.document() if reached else None
+    summary["predicted_mm"] = reached.document(summary) if reached else None
     summary |= {"up": up} if (up := up_of(estimate, known)) else {}
     summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, known)) else {}
     summary["seconds"] = time.monotonic() - began
