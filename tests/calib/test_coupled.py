@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import yaml
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.effects import GEOMETRY, load_effects
 from calib.evaluation.arm import Arm
@@ -66,7 +68,7 @@ def test_a_joint_that_follows_further_than_drawn_is_named_and_its_urdf_says_how_
     truth = np.array([-0.003, 0.498 * -1.503 - 0.5 * -1.5])  # of the shoulder, which both follow
     assert (np.abs(found.estimate - truth) < 4 * found.sigma).all()
     assert (found.sigma < np.abs(truth) / 4).all()
-    export(run, tmp_path / "out", ["urdf"])
+    export(run, tmp_path / "out", ["urdf", "dh"])
     fitted = FrameTree(read_arm(tmp_path / "out/arm.urdf", "arm_base", "arm_end"))
     assert [edge.joint.factor for edge in fitted.edges[2:4]] == pytest.approx(
         np.add([-1.5, -0.75], found.estimate), abs=1e-12
@@ -75,6 +77,33 @@ def test_a_joint_that_follows_further_than_drawn_is_named_and_its_urdf_says_how_
     T = fitted.place("arm_end", joints).Ts_root_frame
     # Tilts of 1e-3 and a turn of 6e-4 on one edge are one twist in the fit, a product in the URDF.
     np.testing.assert_allclose(T, Arm.of(run).corrected(joints), atol=1e-6)
+    table = yaml.safe_load((tmp_path / "out/dh.yaml").read_text())["calibrated"]
+    for T_base_tip, (lift, shoulder) in zip(T, joints, strict=True):
+        there = by_table(table, {"lift": lift, "shoulder": shoulder})
+        np.testing.assert_allclose(there.as_matrix(), T_base_tip, atol=1e-8)
+
+
+def by_table(table, read):
+    """T_base_tip as the header of dh.yaml has it, of joints that are read."""
+
+    def pose(of):
+        turn = Rotation.from_euler("xyz", of["rpy_rad"])
+        return RigidTransform.from_components(of["xyz_m"], turn)
+
+    def moved(along_m=(0, 0, 0), about=(0, 0, 0)):
+        return RigidTransform.from_components(along_m, Rotation.from_rotvec(about))
+
+    T = pose(table["base"])
+    for row in (*table["links"], table["last"]):
+        q = read.get(row["joint"], 0.0)
+        if "follows" in row:
+            q = row["multiplier"] * read[row["follows"]] + row["offset"]
+        slid, turned = (q, 0.0) if row["kind"] == "prismatic" else (0.0, q)
+        theta, d = row.get("theta_rad", 0.0) + turned, row.get("d_m", 0.0) + slid
+        T = T * moved((0, 0, d), (0, 0, theta)) * moved((row.get("a_m", 0.0), 0, 0))
+        T = T * moved(about=(row.get("alpha_rad", 0.0), 0, 0))
+        T = T * moved(about=(0, row.get("beta_rad", 0.0), 0))
+    return T * pose(table["tip"])
 
 
 def test_a_joint_that_goes_a_little_with_the_one_before_it_is_named(tmp_path):
