@@ -294,20 +294,24 @@ class Stops:
         own = {} if self.noise is None else {self.noise: placed.d_joint}
         return Placed(placed.Ts_root_frame, BySite(sites, parts, own))
 
-    def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
-        """T_world_frame = T_world_root @ exp(effects of the root) @ T_root_frame."""
+    def from_stand(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
+        """T_stood_frame = exp(effects of the root) @ T_root_frame, from where the root stood."""
         inner = self.in_root(frame, values, derivatives)
-        T_stood_frame, d = inner.T, inner.d
-        if self.root_bases:
-            twists = sum(basis @ values[name] for name, basis in self.root_bases.items())
-            T_stood_frame = se3.exp(twists) @ inner.T
-        T = values[self.root] @ T_stood_frame
+        if not self.root_bases:
+            return inner
+        twists = sum(basis @ values[name] for name, basis in self.root_bases.items())
+        T = se3.exp(twists) @ inner.T
+        by = se3.adjoint(se3.inverse(inner.T)) @ se3.right_jacobian(twists)
+        d = inner.d.at_site(Site.ROOT, by, self.root_bases) if derivatives else {}
+        return Placed(T, d)
+
+    def in_world(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
+        """T_world_frame = T_world_root @ T_stood_frame."""
+        inner = self.from_stand(frame, values, derivatives)
+        T = values[self.root] @ inner.T
         if not derivatives:
             return Placed(T, {})
-        if self.root_bases:
-            by = se3.adjoint(se3.inverse(inner.T)) @ se3.right_jacobian(twists)
-            d = d.at_site(Site.ROOT, by, self.root_bases)
-        return Placed(T, d.beside({self.root: se3.adjoint(se3.inverse(T_stood_frame))}))
+        return Placed(T, inner.d.beside({self.root: se3.adjoint(se3.inverse(inner.T))}))
 
     def in_reference(self, frame: str, values: Values, derivatives: bool = True) -> Placed:
         """T_reference_frame = inverse(T_world_reference) @ T_world_frame."""
@@ -365,7 +369,6 @@ def place(
     view = View(rig, len(joints), columns, joints)
     edge_bases, edges = _acting(terms, Site.EDGE, view)
     joint_bases, axes = _acting(terms, Site.JOINTS, view)
-    of_root = (t for t in terms if t.effect.site is Site.ROOT and not t.effect.widens)
     return Stops(
         rig=rig,
         joints=joints,
@@ -373,7 +376,7 @@ def place(
         edges=edges,
         joint_bases=joint_bases,
         axes=axes,
-        root_bases={t.variable: t.basis(view) for t in of_root},
+        root_bases={t.variable: t.basis(view) for t in terms if t.effect.site is Site.ROOT},
         root=root,
         reference=reference,
     )

@@ -68,12 +68,10 @@ def concerned(effect: Effect, sources: Sequence[Source]) -> bool:
     a tracker alone lacks nothing of a LiDAR, a scanner or targets, and one without sliding joints
     nothing of rails. One that moves between all stops stands on nothing."""
     rigs = [s.rig for s in sources]
-    if effect.needs_standing:
+    if effect.needs_standing or effect.joint_kind == "mimic":
         return any(effect.params(rig) for rig in rigs)
     if effect.site in (Site.BEAM, Site.NOISE) or effect.needs_lidar:
         return any(rig.lidar for rig in rigs)
-    if effect.joint_kind == "mimic":
-        return any(rig.followers for rig in rigs)
     if effect.joint_kind:
         return any(effect.joint_kind in rig.joint_kinds for rig in rigs)
     if effect.site is Site.REFERENCE:

@@ -48,7 +48,7 @@ COLUMN_WORDS = {
     "ring": "ring",
     "time_s": "time",
     "elapsed_s": "time",
-    "wait_s": "how long the arm waits",
+    "waited.s": "how long the arm waits",
     "temperature_c": "temperature",
     "joints": "the arm's pose",
     "tracked": "where the tracked bodies stand",

@@ -231,8 +231,8 @@ class ArmJointLagDecay(ArmJointLag):
     )
     typical = "0.1 to 2 percent of the distance as the arm stops, tau 0.3 to 5 s, size assumed"
     confounded_with = ("arm_joint_lag", "arm_backlash", "arm_joint_scale")
-    covariates = ("joints", "wait_s", "time_s")
-    shape_name, shape = "tau_s", 1.0
+    covariates = ("joints", "waited.s", "time_s")
+    shape_name, shape = "tau_s", 30.0  # where nobody chooses: stops are simulated a minute apart
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         return tuple(replace(param, sigma=0.01) for param in super().params(rig))
@@ -240,9 +240,9 @@ class ArmJointLagDecay(ArmJointLag):
     def shapes(self, stops: View) -> tuple[float, ...]:
         """A grid: from where a thousandth is left after the shortest wait, to where a fifth less is
         left after the longest."""
-        if not self.params(stops.rig) or "wait_s" not in stops.columns:
+        if not self.params(stops.rig) or "waited.s" not in stops.columns:
             return ()
-        waits = stops["wait_s"][stops["wait_s"] > 0]
+        waits = stops["waited.s"][stops["waited.s"] > 0]
         if not len(waits):
             return ()
         least_s, most_s = waits.min() / -np.log(0.001), np.ptp(waits) / -np.log(0.8)
@@ -250,7 +250,7 @@ class ArmJointLagDecay(ArmJointLag):
         return tuple(float(f"{tau:.3g}") for tau in taus)
 
     def basis(self, view: View) -> np.ndarray:
-        left = np.exp(-view["wait_s"] / self.shape)
+        left = np.exp(-view["waited.s"] / self.shape)
         return left[:, None, None] * super().basis(view)
 
 

@@ -126,7 +126,8 @@ class Arm:
         Args:
             joints: (K, J) reported, rad or m, in the order of `Rig.joint_names`.
             columns: (K, ...) that effects of the model ask for, ``temperature_c`` say, or
-                ``moved.<joint>``, which follows from nothing here.
+                ``moved.<joint>``, ``travel.<joint>`` and ``waited.s``, which follow from nothing
+                here.
 
         Raises:
             InputError: a column that an effect asks for is not given.

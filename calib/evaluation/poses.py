@@ -71,7 +71,7 @@ def to_give(column: str) -> str:
     """The column of a table of poses from which one follows that effects look at."""
     if column == "torques":
         return "<joint>.torque of each joint"
-    follows = column in ("elapsed_s", "wait_s") or column.startswith(("travel.", "moved."))
+    follows = column == "elapsed_s" or column.startswith(("travel.", "moved.", "waited."))
     return "time_s" if follows else column
 
 

@@ -15,8 +15,8 @@ from sensors.readers.base import Track
 
 STILL_WINDOW_S = 0.25  # rates are smoothed over it: an arm takes longer to move
 REST_SHARE = 0.1  # of the time at least, things are taken to be at rest
-FACTOR = 3.0  # times the rms rate at rest, which noise of one component exceeds 1 time in 400
-WILD = 2.0  # times that again, and it is no noise, however short
+FACTOR = 3.0  # times the rms rate at rest: noise along one axis exceeds it 1 time in 370
+WILD = 2.0  # times that again, and it is no noise, however short: a choice
 SLOWEST, FASTEST = 0.003, 0.05  # rad/s or m/s between which the threshold lies
 SETTLE_S = 0.3  # cut from both ends of a hold
 # Ten turns of a LiDAR, by which its noise averages to a third; the rms rate is taken over it, too.
@@ -40,7 +40,8 @@ def find_holds(
     """Find when nothing moves: no joint, no tracked body, no gyro.
 
     A rate is small if it stays below three times its rms at rest, which is that of the quietest
-    tenth of the log, held between 3 and 50 mrad/s (mm/s); `threshold` replaces it. A log that
+    tenth of the log, held between 3 and 50 mrad/s (mm/s), or exceeds that as shortly and as little
+    as noise does; `threshold` replaces all this. A log that
     does not see something, neither makes nor breaks a hold, and holds are cut short by 0.3 s at
     both ends, in which things settle.
 
@@ -63,7 +64,8 @@ def find_holds(
     still, said = [], []
     for time_s, rate, name in rates:
         limit = threshold if threshold is not None else learned(time_s, rate)
-        still.append(_spans(time_s, _at_rest(time_s, rate, limit), ~np.isfinite(rate)))
+        calm = rate < limit if threshold is not None else _at_rest(time_s, rate, limit)
+        still.append(_spans(time_s, calm, ~np.isfinite(rate)))
         said.append(f"holds: {name} is at rest below {1e3 * limit:.1f} mrad/s or mm/s")
     together = still[0]
     for other in still[1:]:

@@ -32,8 +32,8 @@ FAR_WORSE = 2.0
 # may lie a little beyond.
 BEYOND_SPAN = 0.1
 BEYOND_MODEL = (
-    "that is by what the model knows; of stops held out it is {:.2f} mm off, where {:.2f} mm is "
-    "expected"
+    "a prediction holds what the model knows: stops held out are off by {:.2f} mm rms, where "
+    "{:.2f} mm is expected"
 )
 TOLD_SHARE = 0.95  # of errors that lie below what is told
 

@@ -173,14 +173,16 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
 
 def up_of(estimate: Estimate, known: Intervals) -> dict[str, Any] | None:
     """Which way is up in the world's frame, as levels and rods tell, as summary.json holds it; None
-    where no rig has a level.
+    where no rig has a level, and all that is known of up was given.
 
     Args:
         estimate: the solution.
         known: how well its unknowns are known.
     """
     problem = estimate.problem
-    if GRAVITY not in problem.variables or not any(s.rig.levels for s in problem.sources):
+    if GRAVITY not in problem.variables or not any(
+        s.rig.levels and s.rig.levels.frames for s in problem.sources
+    ):
         return None
     g, by_gravity = down(estimate.values[GRAVITY])
     C = by_gravity @ known.over(estimate, [GRAVITY]) @ by_gravity.T

@@ -25,9 +25,9 @@ def stop_columns(
     Each joint by its name as reported, rad or m; ``torques`` (K, J), N m or N, where any column
     ``<joint>.torque`` was recorded; ``payload_kg`` of the first tip where ``<tip>.payload_kg`` of
     any was; and, where the times are known: ``time_s``; ``elapsed_s`` since the first stop;
-    ``wait_s`` since the stop before; ``travel.<joint>``, how far a joint went since then, rad or m;
-    ``moved.<joint>``, which way: -1, 0 or 1. Of the first stop these three are 0: nothing is known
-    of it.
+    ``waited.s`` since the stop before; ``travel.<joint>``, how far a joint went since then, rad or
+    m; ``moved.<joint>``, which way: -1, 0 or 1. Of the first stop these three are 0: nothing is
+    known of it.
 
     Args:
         rig: whose joints they are.
@@ -51,7 +51,7 @@ def stop_columns(
     travel[order[1:]] = np.diff(joints[order], axis=0)
     wait_s[order[1:]] = np.diff(time_s[order])
     elapsed_s = time_s - time_s.min(initial=np.inf)
-    columns |= {"time_s": time_s, "elapsed_s": elapsed_s, "wait_s": wait_s}
+    columns |= {"time_s": time_s, "elapsed_s": elapsed_s, "waited.s": wait_s}
     for name, went in zip(rig.joint_names, travel.T, strict=True):
         columns |= {f"travel.{name}": went, f"moved.{name}": np.sign(went)}
     return columns

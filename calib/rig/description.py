@@ -288,6 +288,9 @@ def _check_frames(file: RigDocument, tree: FrameTree, where: _Where) -> None:
     for i, joint in enumerate(file.arm.passive if file.arm else ()):
         if joint not in tree.joint_names:
             raise where.wrong(unknown_name("joint", joint, tree.joint_names), "arm", "passive", i)
+    if file.levels and not file.levels.frames and not file.tracker:
+        what = "without frames it is the tracker that tells how the rig lies; give one, or frames"
+        raise where.wrong(what, "levels", "up")
     if file.levels and file.levels.up and not (file.tracker or file.reference):
         what = "nothing here has a world to be upright in; give a tracker or a reference, or no up"
         raise where.wrong(what, "levels", "up")

@@ -131,6 +131,8 @@ class LevelsDocument(Document):
             raise ValueError("it has neither frames nor up; give one of them, or both")
         if self.frames and self.sigma_rad is None:
             raise ValueError("frames have no sigma_rad; say how sure a direction is")
+        if not self.frames and (self.sigma_rad or self.sigma_zero_rad):
+            raise ValueError("sigma_rad and sigma_zero_rad are of frames; name these, too")
         return self
 
 

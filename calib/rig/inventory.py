@@ -284,7 +284,7 @@ def odd_payloads(rig: Rig, recording: RecordedStops) -> Iterator[str]:
 
 def _head_down(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     """Levels that say the rig hangs head down."""
-    if rig.levels and up_in_root(rig, recording).mean(axis=0)[2] < HEAD_DOWN:
+    if rig.levels and rig.levels.frames and up_in_root(rig, recording).mean(axis=0)[2] < HEAD_DOWN:
         yield (
             f"levels say that z of '{rig.tree.root}' points down; at rest they are to read 1 g "
             "along what points up. Does the rig hang from a ceiling? Else turn the signs of .ax, "
@@ -298,14 +298,14 @@ def _leans(rig: Rig, recording: RecordedStops) -> Iterator[str]:
         return
     ups = np.stack([in_root(rig, recording, up) for up in OFTEN_UP], axis=1)
     ups = ups[np.isfinite(ups[:, 0, 0])].mean(axis=0) if np.isfinite(ups).any() else UPRIGHT[None]
-    lean_rad = np.arccos(np.clip(ups[:, 2] / np.linalg.norm(ups, axis=1), -1.0, 1.0)).min()
-    if lean_rad > LEANS_RAD:
-        root = rig.tree.root
+    lean_rad = np.arccos(np.clip(ups[:, 2] / np.linalg.norm(ups, axis=1), -1.0, 1.0))
+    if lean_rad.min() > LEANS_RAD:
+        root, (z_deg, y_deg) = rig.tree.root, np.degrees(lean_rad)
         yield (
-            f"z of '{root}' leans by {np.degrees(lean_rad):.0f} deg from z and y of the tracker's "
-            f"frame. The weight of the arm's links is taken to pull along z of '{root}'; if it "
-            "does not, say where up is in the tracker's frame, as by levels: {up: [0, 0, 1], "
-            "sigma_up_rad: 0.005} in rig.yaml, or put a level on the rig"
+            f"z of '{root}' leans by {z_deg:.0f} deg from z of the tracker's frame, and by "
+            f"{y_deg:.0f} deg from its y. The weight of the arm's links is taken to pull along z "
+            f"of '{root}'; if it does not, say where up is in the tracker's frame, as by levels: "
+            "{up: [0, 0, 1], sigma_up_rad: 0.005} in rig.yaml, or put a level on the rig"
         )
 
 

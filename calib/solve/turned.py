@@ -99,7 +99,7 @@ def _in_root(body: TrackedBody, values: Values) -> Placed:
     """T_root_body, what encoders misreport at single stops left out."""
     stops = body.stops
     own = {stops.noise: np.zeros(stops.joints.shape)} if stops.noise else {}
-    return stops.in_root(body.body, {**values, **own})
+    return stops.from_stand(body.body, {**values, **own})
 
 
 def _angles(problem: Problem, bodies: Sequence[TrackedBody]) -> list[tuple[str, int]]:

@@ -173,8 +173,8 @@ class Scene:
         return np.reshape(ends, (-1, 2, 3))[drawn], np.array(arm, bool)[drawn]
 
     def twists(self, recording: int, stop: str) -> tuple[np.ndarray, np.ndarray]:
-        """By which twist (E, 6) each edge of the rig differs at a stop from what is drawn, by all
-        effects of the model, and its covariance (E, 6, 6); NaN where an effect has none.
+        """By which twist (E, 6) each edge of the rig differs at a stop from what is drawn, by
+        all effects on edges, and its covariance (E, 6, 6); NaN where an effect has none.
 
         Raises:
             InputError: nothing was measured at the stop.

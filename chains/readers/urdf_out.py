@@ -132,7 +132,7 @@ def with_mimics(
         if start is None:
             raise InputError(f"{where}: there is no joint '{name}' that mimics another")
         new = {
-            b"joint": xml_attribute(other)[1:-1].encode("ascii", "xmlcharrefreplace"),
+            b"joint": _in_any_quotes(other),
             b"multiplier": _words([multiplier]),
             b"offset": _words([offset]),
         }
@@ -196,6 +196,12 @@ def _fixed(edge: Edge, taken: set[str]) -> str:
 
 def _attributes(T: Array) -> bytes:
     return b' xyz="%s" rpy="%s"' % (_words(T[:3, 3]), _words(se3.to_rpy(T)))
+
+
+def _in_any_quotes(name: str) -> bytes:
+    """A name as it may stand between quotes of either kind."""
+    text = xml_attribute(name)[1:-1].replace('"', "&quot;").replace("'", "&apos;")
+    return text.encode("ascii", "xmlcharrefreplace")
 
 
 def _words(values: Array) -> bytes:

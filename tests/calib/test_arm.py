@@ -66,6 +66,7 @@ def test_it_is_where_the_graph_has_it(source, name, tip):
     columns = {c: rng.uniform(10, 30, 50) for c in COLUMNS}
     for joint, travel in zip(source.rig.joint_names, rng.uniform(-1, 1, (3, 50)), strict=True):
         columns |= {f"moved.{joint}": np.sign(travel), f"travel.{joint}": travel}
+    columns["waited.s"] = rng.uniform(1.0, 100.0, 50)
     columns["torques"] = rng.uniform(-30, 30, (50, 3))
     columns |= {j: q for j, q in zip(source.rig.joint_names, joints.T, strict=True)}
     arm = Arm.as_found(source, part, known, tip)

@@ -208,7 +208,7 @@ def test_what_a_model_that_is_too_small_predicts_stands_beside_what_it_is_off_by
         told[name] = run.summary["predicted_mm"]["told"], run.summary["rms_mm"]["held_out"]
     (whole, _), (small, off_mm) = told["whole"], told["small"]
     assert len(whole) == 1 and len(small) == 2
-    assert f"of stops held out it is {off_mm:.2f} mm off" in small[1] and off_mm > 0.5
+    assert f"stops held out are off by {off_mm:.2f} mm" in small[1] and off_mm > 0.5
 
 
 def test_a_box_is_small_where_the_prediction_outside_is_much_worse():

@@ -218,6 +218,7 @@ def test_backlash_follows_the_way_each_joint_came(source):
     np.testing.assert_allclose(columns["travel.joint_1"], [0, 0.1, 0.1])
     np.testing.assert_allclose(columns["travel.joint_2"], [0, -1, 1])
     np.testing.assert_array_equal(columns["elapsed_s"], [0, 850, 350])
+    np.testing.assert_array_equal(columns["waited.s"], [0, 500, 350])
     np.testing.assert_array_equal(columns["joint_2"], [1, 1, 2])
     basis = find("arm_backlash").basis(View(source.rig, 3, columns, joints))
     np.testing.assert_array_equal(basis[1], np.diag([1, -1, 0, 0, 0, 0]))

@@ -198,6 +198,7 @@ def test_columns_that_rig_yaml_does_not_declare_are_named(recording, tmp_path):
         ({"frames": ["arm_33"], "sigma_rad": 0.001}, r"levels\.frames\.0: .*arm_3"),
         ({"frames": [], "sigma_rad": 0.001}, "neither frames nor up"),
         ({"frames": ["base"]}, "no sigma_rad"),
+        ({"up": [0, 0, 1], "sigma_up_rad": 0.1, "sigma_rad": 0.1}, "name these, too"),
         ({"frames": ["base", "base"], "sigma_rad": 0.001}, "base is there twice"),
         ({"frames": ["base"], "sigma_rad": 0.001, "up": [0, 0, 1]}, "give both, or neither"),
         (levelled("base", up=[0, 0, 0], sigma_up_rad=0.1), "points nowhere"),

@@ -78,6 +78,24 @@ def test_an_arm_that_stands_askew_sags_along_an_up_that_is_known(askew, tmp_path
 
 def test_a_check_asks_where_up_is_of_an_arm_that_stands_askew(askew):
     (said,) = (line for line in check(askew, graph=False).odd if "leans" in line)
-    assert "z of 'base' leans by 31 deg" in said and "levels: {up: [0, 0, 1]" in said
+    assert "z of 'base' leans by 31 deg from z" in said and "levels: {up: [0, 0, 1]" in said
     with_levels(askew, UP)
     assert not any("leans" in line for line in check(askew, graph=False).odd)
+
+
+def test_a_head_down_arm_is_told_nothing_of_levels_that_it_has_not(askew):
+    with_levels(askew, {**UP, "up": [0.0, 0.0, -1.0]})
+    assert not any("levels say" in line for line in check(askew, graph=False).odd)
+
+
+def test_an_up_alone_needs_a_tracker(askew):
+    rig = yaml.safe_load((askew / "rig.yaml").read_text())
+    del rig["tracker"]
+    (askew / "rig.yaml").write_text(yaml.safe_dump(rig | {"levels": UP}))
+    (said,) = check(askew, graph=False).problems
+    assert "levels.up" in said and "give one, or frames" in said
+
+
+def test_an_up_that_was_given_is_no_finding(askew, tmp_path):
+    run = calibrate([with_levels(askew, UP)], tmp_path / "run", Model(GEOMETRY))
+    assert "up" not in run.summary

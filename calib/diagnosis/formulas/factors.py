@@ -33,7 +33,7 @@ WIDE_ENOUGH = 1.5  # largest over smallest value, from which powers differ from 
 LEAST_SHARE = 0.005  # of the beams that a class must have
 # Columns that name a part of the room, a beam or a stop, and so are no covariate; the rest of the
 # room is in range, incidence and label.
-NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s", "wait_s"}
+NOT_COVARIATES = {"surface", "region", "patch", "plane", "column", "elapsed_s"}
 NOT_COVARIATES |= {"reference_intensity", "stop", "location", "tracked", "normal", "point_m"}
 
 
@@ -162,7 +162,7 @@ def covariates_of(view: View) -> Iterator[tuple[str, np.ndarray]]:
     """Names and columns that residuals may depend on: (N,), or (1,) where one value holds for
     all."""
     for name in view.columns:
-        if name in NOT_COVARIATES or name.startswith(("moved.", "travel.")):
+        if name in NOT_COVARIATES or name.startswith(("moved.", "travel.", "waited.")):
             continue
         values = np.asarray(view[name])
         if values.ndim == 1 and values.dtype.kind in "biuf":

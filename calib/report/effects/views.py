@@ -152,7 +152,7 @@ def _stops(rig: Rig) -> Walk:
     """A few stops, one after the other."""
     joints = np.random.default_rng(0).uniform(-1.5, 1.5, (STOPS, len(rig.joint_names)))
     travel = np.diff(joints, axis=0, prepend=np.zeros((1, joints.shape[1])))
-    columns = {"wait_s": np.linspace(0.5, 4.0, STOPS)}
+    columns = {"waited.s": np.linspace(0.5, 4.0, STOPS)}
     for k, joint in enumerate(rig.joint_names):
         columns[f"moved.{joint}"], columns[f"travel.{joint}"] = np.sign(travel[:, k]), travel[:, k]
     x = np.arange(1.0, STOPS + 1)

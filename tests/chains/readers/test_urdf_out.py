@@ -11,7 +11,13 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from chains.arm import read_arm
 from chains.errors import InputError
 from chains.frames import Edge
-from chains.readers.urdf_out import empty_robot, with_comment, with_frames, with_origins
+from chains.readers.urdf_out import (
+    empty_robot,
+    with_comment,
+    with_frames,
+    with_mimics,
+    with_origins,
+)
 
 # As people write them: comments that hold tags, a transmission with joints of the same name,
 # both kinds of quotes, tags over several lines, origins and parts of them left out, letters of
@@ -214,3 +220,21 @@ def test_frames_alone_are_a_robot(tmp_path):
 def test_what_cannot_be_edited_is_refused(text, complaint, origins):
     with pytest.raises(InputError, match=complaint):
         with_origins(text, {"a": origins["a"]}, "arm.urdf")
+
+
+@pytest.mark.parametrize("quote", ["'", '"'])
+def test_a_joint_that_follows_another_is_given_another_multiplier(tmp_path, quote):
+    """Whatever the names of joints, and with an offset that the file leaves out."""
+    leads = """a'"<b"""
+    name = "".join(f"&#{ord(letter)};" for letter in leads)
+    mimic = f"<mimic multiplier={quote}2{quote} joint={quote}{name}{quote}/>"
+    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    joint = '<joint name="{}" type="continuous"><parent link="l{}"/><child link="l{}"/>{}</joint>'
+    text = f'<robot name="r">{links}{joint.format(name, 0, 1, "")}{joint.format("f", 1, 2, mimic)}'
+    changed = with_mimics(f"{text}</robot>".encode(), {"f": (leads, 2.5, -0.1)}, "arm.urdf")
+    (tmp_path / "arm.urdf").write_bytes(changed)
+    _, follower = read_arm(tmp_path / "arm.urdf", "l0", "l2")
+    joint = follower.joint
+    assert (joint.name, joint.factor, joint.shift, joint.leads) == (leads, 2.5, -0.1, False)
+    with pytest.raises(InputError, match="no joint 'g' that mimics"):
+        with_mimics(changed, {"g": (leads, 1.0, 0.0)}, "arm.urdf")
