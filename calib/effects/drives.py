@@ -43,11 +43,11 @@ class ArmJointCoupling(Effect):
     site = Site.JOINTS
     unit = "1"
     formula = "q_i = reported_i + c_ik * reported_k, k the two joints before i"
-    typical = "0.01 to 1 percent, size assumed; 1 where it is left out, as of joint 5 in joint 6"
+    typical = "up to 0.1 percent, size assumed; 1 where it is left out, as of joint 5 in joint 6"
     covariates = ("joints",)
     confounded_with = ("arm_joint_scale", "arm_joint_offset", "arm_backlash")
     source = "coupling matrix of Staubli RX arms: softMC wiki, PUMA robot model; size assumed"
-    sigma = 0.01
+    sigma = 0.001
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         unit = rig.joint_units
@@ -229,13 +229,13 @@ class ArmJointLagDecay(ArmJointLag):
         "q_i = reported_i + k_i * (how far joint i went) * exp(-wait / tau), "
         "wait since the stop before"
     )
-    typical = "0.1 to 2 percent of the distance as the arm stops, tau 0.3 to 5 s, size assumed"
+    typical = "0.1 to 1 percent of the distance as the arm stops, tau 0.3 to 5 s, size assumed"
     confounded_with = ("arm_joint_lag", "arm_backlash", "arm_joint_scale")
     covariates = ("joints", "waited.s", "time_s")
     shape_name, shape = "tau_s", 30.0  # where nobody chooses: stops are simulated a minute apart
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
-        return tuple(replace(param, sigma=0.01) for param in super().params(rig))
+        return tuple(replace(param, sigma=0.005) for param in super().params(rig))
 
     def shapes(self, stops: View) -> tuple[float, ...]:
         """A grid: from where a thousandth is left after the shortest wait, to where a fifth less is
