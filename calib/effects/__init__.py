@@ -200,7 +200,8 @@ CATALOGUE: tuple[Effect, ...] = (
     ReferenceScatter(),
 )
 DEFAULT = ("arm_link_length", "arm_joint_offset", "ring_range_offset")
-GEOMETRY = ("arm_link_length", "arm_joint_offset", "arm_geometry")  # all that an arm's can be
+# All that an arm's can be; the last of an arm in which joints follow others.
+GEOMETRY = ("arm_link_length", "arm_joint_offset", "arm_geometry", "arm_mimic_ratio")
 
 __all__ = [
     "CATALOGUE",

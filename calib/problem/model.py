@@ -227,7 +227,7 @@ def default_effects(
     Raises:
         InputError: what is wrong with a recording's rig or stops.
     """
-    rows, most = 0, 0
+    rows, most, has = 0, 0, set[str]()
     for folder in recordings:
         if not (remote.here(folder) / "rig.yaml").is_file():
             continue  # what it is instead, the fit says
@@ -238,9 +238,11 @@ def default_effects(
                 pose = np.isfinite(recording.bodies[body])
                 rows += 3 * int(pose[:, :3].all(axis=1).sum() + pose.all(axis=1).sum())
             arm = [effects.find(name) for name in effects.GEOMETRY]
+            has |= {effect.name for effect in arm if effect.params(rig)}
             most = max(most, sum(p.sigma > 0 for effect in arm for p in effect.params(rig)))
     told = 0 < ROWS_A_PARAMETER * most <= rows
-    usual = (*effects.DEFAULT, *(n for n in effects.GEOMETRY if told and n not in effects.DEFAULT))
+    whole = [name for name in effects.GEOMETRY if told and name in has]
+    usual = (*effects.DEFAULT, *(name for name in whole if name not in effects.DEFAULT))
     lasting = (effect for effect in known if not effect.goes_with_time)
     return (*usual, *(effect for effect in lasting if effect.name not in usual))
 

@@ -163,8 +163,8 @@ class Rig:
 
     @property
     def followers(self) -> list[Edge]:
-        """Edges of joints that follow another."""
-        return [e for e in self.tree.edges if e.joint is not None and not e.joint.leads]
+        """Edges of joints that follow another, whether that is in the chains or not."""
+        return [e for e in self.tree.edges if e.joint is not None and e.joint.name != e.name]
 
     @property
     def turning(self) -> frozenset[str]:

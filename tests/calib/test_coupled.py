@@ -5,7 +5,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from calib.effects import GEOMETRY, load_effects
+from calib.effects import DEFAULT, GEOMETRY
 from calib.evaluation.arm import Arm
 from calib.exporters import export
 from calib.problem.model import Model, Source
@@ -18,16 +18,16 @@ from ..chains.test_mimic import ARM
 from . import arm_worlds
 
 
-def written(folder, rng, true_urdf=ARM, poses=100):
+def written(folder, rng, true_urdf=ARM, poses=100, drawn=ARM):
     """A recording of an arm that is as one URDF has it, and drawn as another."""
     folder.mkdir()
     (folder / "arm.urdf").write_text(true_urdf)
     edges = read_arm(folder / "arm.urdf", "arm_base", "arm_end")
-    (folder / "arm.urdf").write_text(ARM)
+    (folder / "arm.urdf").write_text(drawn)
     world = arm_worlds.ArmWorld(
         edges=edges,
         twists={e.name: 1e-3 * rng.normal(size=6) for e in edges},
-        zeros={"lift": 2e-3, "shoulder": -3e-3},
+        zeros={e.joint.name: 2e-3 for e in edges if e.joint is not None},
         tool=rng.normal(size=6) * np.repeat([0.01, 0.005], 3),
         T_world_base=arm_worlds.somewhere(rng),
     )
@@ -56,11 +56,12 @@ def test_a_joint_that_follows_further_than_drawn_is_named_and_its_urdf_says_how_
     true = ARM.replace('multiplier="-1.5"', 'multiplier="-1.503"')
     true = true.replace('multiplier="0.5"', 'multiplier="0.498"')
     folder = written(tmp_path / "rec", rng, true)
-    diagnosis = diagnose(calibrate([folder], tmp_path / "run", Model(GEOMETRY))).document()
+    without = Model(GEOMETRY[:-1])
+    diagnosis = diagnose(calibrate([folder], tmp_path / "run", without)).document()
     assert diagnosis["verdict"] == "missing_effect"
     assert [c["effect"] for c in diagnosis["candidates"] if c["step"]] == ["arm_mimic_ratio"]
-    effects = load_effects([*GEOMETRY, "arm_mimic_ratio"])
-    run = calibrate([folder], tmp_path / "added", Model(effects))
+    run = calibrate([folder], tmp_path / "usual")  # where nobody chooses
+    assert run.model["effects"] == [*DEFAULT, "arm_geometry", "arm_mimic_ratio"]
     rms = run.summary["rms_mm"]
     assert rms["held_out"] < 1.3 * rms["noise_floor"] < 0.15
     found = run.solution.part(None).effects["arm_mimic_ratio"]
@@ -104,6 +105,25 @@ def by_table(table, read):
         T = T * moved(about=(row.get("alpha_rad", 0.0), 0, 0))
         T = T * moved(about=(0, row.get("beta_rad", 0.0), 0))
     return T * pose(table["tip"])
+
+
+def test_one_whose_leader_is_not_in_the_chain_may_go_further_too(tmp_path):
+    """What is read is the other, which stands elsewhere on the robot."""
+    ends = '<parent link="arm_base"/><child link="aside"/>'
+    side = f'<joint name="side" type="continuous">{ends}</joint>'
+    drawn = ARM.replace('joint="shoulder"', 'joint="side"').replace('joint="elbow"', 'joint="side"')
+    drawn = drawn.replace("</robot>", f'<link name="aside"/>{side}</robot>')
+    true = drawn.replace('multiplier="-1.5"', 'multiplier="-1.503"')
+    folder = written(tmp_path / "rec", np.random.default_rng(5), true, drawn=drawn)
+    run = calibrate([folder], tmp_path / "run")
+    found = run.solution.part(None).effects["arm_mimic_ratio"]
+    assert found.names == ("elbow", "wrist")
+    assert (np.abs(found.estimate - [-0.003, 0.0]) < 4 * found.sigma).all()
+    export(run, tmp_path / "out", ["urdf"])
+    fitted = FrameTree(read_arm(tmp_path / "out/arm.urdf", "arm_base", "arm_end"))
+    joints = np.random.default_rng(6).uniform(-0.2, 0.2, (20, 3))
+    T = fitted.place("arm_end", joints).Ts_root_frame
+    np.testing.assert_allclose(T, Arm.of(run).corrected(joints), atol=1e-6)
 
 
 def test_a_joint_that_goes_a_little_with_the_one_before_it_is_named(tmp_path):
