@@ -75,8 +75,9 @@ def find_holds(
     spans = together[long]
     if not len(spans):
         raise InputError(
-            f"nothing stands still for {min_hold_s:g} s anywhere in the logs; say --still "
-            "RAD_PER_S for what is at rest, or --min-hold SECONDS"
+            f"nothing stands still for {min_hold_s + 2 * SETTLE_S:g} s anywhere in the logs, that "
+            f"is {min_hold_s:g} s and {SETTLE_S:g} s to settle at both ends; say --still RAD_PER_S "
+            "for what is at rest, or --min-hold SECONDS"
         )
     lengths = spans[:, 1] - spans[:, 0]
     said.append(

@@ -100,9 +100,20 @@ def up_in_root(rig: Rig, recording: RecordedStops) -> np.ndarray:
 
 
 def in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
+    """As `in_root_at`, on median for as long as the rig stands still."""
+    there = in_root_at(rig, recording, direction)
+    places = recording.location if rig.moves == "location" else np.zeros(len(there), int)
+    for place in np.unique(places) if rig.moves != "stop" else ():
+        some = there[places == place]
+        if np.isfinite(some).any():
+            there[places == place] = np.nanmedian(some, axis=0)
+    return there / np.linalg.norm(there, axis=1, keepdims=True)
+
+
+def in_root_at(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
     """Unit vectors (K, 3) in the root's frame that point where a direction (3,) does in the
-    tracker's, the rig lying as the body with the fewest joints before it says, on median for as
-    long as it stands still; NaN where that is not seen."""
+    tracker's, the rig lying at each stop as the body with the fewest joints before it says; NaN
+    where that is not seen."""
     tracked, bodies = tracked_poses(rig, recording), rig.tracker.bodies
     read = [b for b in bodies if set(rig.passive).isdisjoint(rig.joints_to(b))]
     read = [b for b in read if np.isfinite(tracked[:, bodies.index(b), 0, 0]).any()]
@@ -112,11 +123,6 @@ def in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> n
     R_world_body = tracked[:, bodies.index(body), :3, :3]
     R_root_body = rig.tree.transform(body, recording.joints)[:, :3, :3]
     there = np.matvec(R_root_body @ R_world_body.mT, np.array(direction, float))
-    places = recording.location if rig.moves == "location" else np.zeros(len(there), int)
-    for place in np.unique(places) if rig.moves != "stop" else ():
-        some = there[places == place]
-        if np.isfinite(some).any():
-            there[places == place] = np.nanmedian(some, axis=0)
     return there / np.linalg.norm(there, axis=1, keepdims=True)
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig import Rig
-from calib.rig.columns import PAYLOAD, in_root, up_in_root
+from calib.rig.columns import PAYLOAD, in_root_at, up_in_root
 from calib.rig.suspect import listed
-from chains.arm import UPRIGHT
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
 from sensors.stops import Targets, level_columns, undeclared_levels
@@ -40,6 +39,7 @@ FEWEST_IN_ORDER = 6  # rows: in any order, two of so many are out of it in 1 of 
 HEAD_DOWN = -0.5  # of the root's z along what points up: of a rig on a wall it is about 0
 LEANS_RAD = 0.1  # its sine: of what weights do, as much is taken to act across or not at all
 OFTEN_UP = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)  # in the frames of trackers
+AGREEING = 0.995  # length of a mean direction: those of stops scatter by 0.1 rad
 ALL_ALIKE = 3  # links of one and the same mass: no maker's, but what is written until one is known
 SLOWEST_S = 6 * 3600.0  # from stop to stop: a choice, as no arm takes a quarter of a day
 FIRST_DATE_S, LAST_DATE_S = 9.46e8, 1e10  # since 1970: of 2000, and of the year 2286
@@ -293,20 +293,33 @@ def _head_down(rig: Rig, recording: RecordedStops) -> Iterator[str]:
 
 
 def _leans(rig: Rig, recording: RecordedStops) -> Iterator[str]:
-    """An arm that stands askew in the tracker's frame, of which nothing says where up is."""
-    if rig.levels or not rig.masses or rig.tracker is None:
+    """An arm that stands askew in the tracker's frame, of which nothing says where up is; or that
+    leans from where that is said to be."""
+    if not rig.masses or rig.tracker is None or (rig.levels and rig.levels.frames):
         return
-    ups = np.stack([in_root(rig, recording, up) for up in OFTEN_UP], axis=1)
-    ups = ups[np.isfinite(ups[:, 0, 0])].mean(axis=0) if np.isfinite(ups).any() else UPRIGHT[None]
-    lean_rad = np.arccos(np.clip(ups[:, 2] / np.linalg.norm(ups, axis=1), -1.0, 1.0))
-    if lean_rad.min() > LEANS_RAD:
-        root, (z_deg, y_deg) = rig.tree.root, np.degrees(lean_rad)
+    ups = [rig.levels.up] if rig.levels else OFTEN_UP
+    there = np.stack([in_root_at(rig, recording, up) for up in ups], axis=1)
+    there = there[np.isfinite(there[:, 0, 0])]
+    mean = there.sum(axis=0) / max(len(there), 1)
+    size = np.linalg.norm(mean, axis=1)
+    if len(there) < 2 or size.min() < AGREEING:  # the joints do not say how it stands
+        return
+    lean_rad, root = np.arccos(np.clip(mean[:, 2] / size, -1.0, 1.0)), rig.tree.root
+    if lean_rad.min() <= LEANS_RAD:
+        return
+    if rig.levels:
         yield (
-            f"z of '{root}' leans by {z_deg:.0f} deg from z of the tracker's frame, and by "
-            f"{y_deg:.0f} deg from its y. The weight of the arm's links is taken to pull along z "
-            f"of '{root}'; if it does not, say where up is in the tracker's frame, as by levels: "
-            "{up: [0, 0, 1], sigma_up_rad: 0.005} in rig.yaml, or put a level on the rig"
+            f"z of '{root}' leans by {np.degrees(lean_rad[0]):.0f} deg from up as rig.yaml has it "
+            "(levels.up): does the arm stand so?"
         )
+        return
+    z_deg, y_deg = np.degrees(lean_rad)
+    yield (
+        f"z of '{root}' leans by {z_deg:.0f} deg from z of the tracker's frame, and by "
+        f"{y_deg:.0f} deg from its y. The weight of the arm's links is taken to pull along z of "
+        f"'{root}'; if it does not, say where up is in the tracker's frame, as by levels: "
+        "{up: [0, 0, 1], sigma_up_rad: 0.005} in rig.yaml, or put a level on the rig"
+    )
 
 
 def odd_levels(recording: RecordedStops) -> Iterator[str]:

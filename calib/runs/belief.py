@@ -10,6 +10,7 @@ import numpy as np
 from calib.blunders.judged import limit_of
 from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
 from calib.residuals.groups import CAD
+from calib.residuals.levels import Level
 from calib.results.errors import judged_mm
 from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
@@ -30,7 +31,9 @@ def misfit_sentence(kind: str, times: float) -> str:
     if kind == CAD:
         return f"frames are {times:.1f} times further from CAD than its sigmas allow"
     what = "errors of the reference" if kind == "reference" else f"residuals of the {kind}"
-    return f"the {what} are {times:.1f} times larger than their sigmas allow"
+    said = f"the {what} are {times:.1f} times larger than their sigmas allow"
+    askew = " (is it askew on the frame that it is named after? Give it a frame of its own)"
+    return said + (askew if kind == Level.kind else "")
 
 
 def _misfit(run: Run, kind: str, times: float) -> str:

@@ -80,7 +80,17 @@ def test_a_check_asks_where_up_is_of_an_arm_that_stands_askew(askew):
     (said,) = (line for line in check(askew, graph=False).odd if "leans" in line)
     assert "z of 'base' leans by 31 deg from z" in said and "levels: {up: [0, 0, 1]" in said
     with_levels(askew, UP)
-    assert not any("leans" in line for line in check(askew, graph=False).odd)
+    (said,) = (line for line in check(askew, graph=False).odd if "leans" in line)
+    assert "leans by 31 deg from up as rig.yaml has it" in said
+
+
+def test_joints_that_are_misread_do_not_lean_an_arm(tmp_path):
+    world = arm_worlds.bent(tmp_path / "rec", "ur10", np.random.default_rng(7))
+    joints = world.draw(np.random.default_rng(8), POSES)
+    read = joints.copy()
+    read[:, 4] -= joints[:, 3]
+    arm_worlds.save(tmp_path / "rec", world, read, world.seen(joints))
+    assert not any("leans" in line for line in check(tmp_path / "rec", graph=False).odd)
 
 
 def test_a_head_down_arm_is_told_nothing_of_levels_that_it_has_not(askew):
