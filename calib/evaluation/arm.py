@@ -27,9 +27,6 @@ from chains.serial import CHUNK, SerialChain
 Columns = Mapping[str, np.ndarray]
 # Steps of the inverse, where the arm is not stretched and where it is.
 USUAL_STEPS, STRETCHED_STEPS = 3, 30
-# Where none were found, joints are sought again from so far (rad, m) along what hardly moves the
-# tip: where two axes lie in line, one has to turn by up to a quarter before the wrist can bend.
-ALONG = (0.8, -0.8, 1.6, -1.6)
 REACHED = 1e-8  # of the arm's length, and rad: no more steps
 # Least damping of a step, of squares of the arm's length; beyond it half the squared error, which
 # keeps steps short where an arm is stretched (Sugihara 2011, IEEE Trans. Robotics 27(5)).
@@ -45,7 +42,8 @@ class Command:
     Args:
         joints: (K, J) rad or m, as the encoders report them.
         off_m, off_rad: (K,) what is left; next to nothing but for arms of less than six joints,
-            where an arm is stretched, and at some poses in which two axes lie in line.
+            where an arm is stretched, and where two axes lie in line: there one may have to turn
+            by up to a quarter before the wrist can bend, and `joints_for` from elsewhere may do.
         went: (K,) how far the joint that goes furthest goes from those asked for, rad or m. Next to
             where two axes lie in line, a small error of the tip takes large turns of both.
         within: (K,) whether all joints are within the limits of the URDF.
@@ -172,16 +170,8 @@ class Arm:
 
         for first in range(0, len(near), CHUNK):
             solve(np.arange(first, min(first + CHUNK, len(near))), near, USUAL_STEPS)
-        begin = command.copy()
-        for along in (0.0, *ALONG):
-            far = np.flatnonzero(np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m)
-            if along and len(far):
-                begin[far] = near[far]
-                begin[np.ix_(far, self._ours)] += along * self._idle(near[far])
-            best = command[far], off[far]
-            solve(far, begin, STRETCHED_STEPS)
-            worse = np.linalg.norm(off[far], axis=1) > np.linalg.norm(best[1], axis=1)
-            command[far[worse]], off[far[worse]] = (x[worse] for x in best)
+        far = np.abs(off).max(axis=1, initial=0.0) > REACHED * self._length_m
+        solve(np.flatnonzero(far), command, STRETCHED_STEPS)
         turned, shifted = np.linalg.norm(off.reshape(-1, 2, 3), axis=2).T
         lower, upper = np.array([[j.lower, j.upper] for j in self.rig.joints]).reshape(-1, 2).T
         return Command(
@@ -214,14 +204,6 @@ class Arm:
             better = moving[nearer]
             command[better], off[better], J[better] = tried[nearer], then[nearer], J_then[nearer]
         return command, off
-
-    def _idle(self, joints: np.ndarray) -> np.ndarray:
-        """By how much of each joint between base and tip (K, n) the drawn tip moves least; the
-        largest is 1."""
-        J = self.drawn.axes(joints[:, self._ours]).jacobian()
-        J[:, :3] *= self._length_m
-        least = np.linalg.svd(J)[2][:, -1]
-        return least / np.abs(least).max(axis=1, keepdims=True)
 
     def _step(self, J: np.ndarray, off: np.ndarray, damped: np.ndarray) -> np.ndarray:
         """How far to turn joints between base and tip (K, n) for tips that are so far off (K, 6),

@@ -105,23 +105,6 @@ def test_what_is_commanded_brings_the_tip_where_it_should_be(tmp_path, name):
     assert (off_m < size + 0.02).all() and np.median(size) > 1e-4, "there was something to correct"
 
 
-def test_a_wrist_in_line_is_turned_as_far_as_it_takes(tmp_path):
-    """Joints 4 and 6 of a KR 6 lie in line where the 5th reads zero: no small turn of any joint
-    turns the tool across, so that 135 of 200 such poses were not reached, up to 5 mm off."""
-    rng = np.random.default_rng(12)
-    world = arm_worlds.bent(tmp_path, "kr6", rng, size=0.0)
-    source = opened(tmp_path, world, rng, poses=2)
-    names = ("arm_link_length", "arm_joint_offset", "arm_geometry")
-    part, known, _ = found(source, names, rng, size=0.3)
-    arm = Arm.as_found(source, part, known)
-    joints = world.draw(rng, 200) * [1, 1, 1, 1, 0, 1]
-    command = arm.to_command(joints)
-    reached = command.off_m < 1e-7
-    assert reached.mean() > 0.9
-    left = se3.log(se3.inverse(arm.drawn.place(joints)) @ arm.corrected(command.joints))
-    assert np.abs(left[reached]).max() < 1e-6
-
-
 def test_an_arm_of_few_joints_says_how_far_it_stays_off(tmp_path):
     rng = np.random.default_rng(7)
     world = arm_worlds.bent(tmp_path, "scara", rng, size=0.0)
