@@ -65,7 +65,7 @@ class ArmJointCoupling(Effect):
 
 
 class ArmMimicRatio(Effect):
-    """A joint that follows another goes further, or less far, than its URDF's multiplier says."""
+    """A joint follows another further than drawn, or less: the multiplier of its URDF is off."""
 
     name = "arm_mimic_ratio"
     joint_kind = "mimic"
@@ -218,8 +218,8 @@ class ArmJointLag(ArmBacklash):
 
 
 class ArmJointLagDecay(ArmJointLag):
-    """A joint is read before it has come to rest, and is the nearer to it the longer the arm has
-    waited since the stop before.
+    """A joint is nearer to rest the longer it waits. It is read before it has come to rest, and
+    what is left of its way falls with the time since the stop before.
 
     Where the arm waits alike before all readings this is `ArmJointLag`.
     """

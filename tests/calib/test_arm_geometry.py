@@ -104,7 +104,7 @@ def test_small_errors_are_told_as_small_ones(tmp_path, name):
     world = arm_worlds.bent(tmp_path, name, rng)
     estimate = fitted(opened(tmp_path, world, rng), GEOMETRY)
     unknowns = estimate.problem.variables
-    for effect in GEOMETRY:
+    for effect in GEOMETRY[:-1]:  # none of these joints follows another
         assert np.all(np.abs(estimate.values[effect]) < 2.5 * unknowns[effect].prior_sigma), effect
 
 
@@ -186,7 +186,7 @@ def test_axes_that_miss_each_other_are_named_first_and_found(shared, tmp_path):
     assert worth_adding(found.candidates)[0] == "arm_geometry"
     assert found.candidates[0]["held_out_rms_mm"]["after"] < 0.1
     whole = calibrate([recording], tmp_path / "whole")
-    assert set(GEOMETRY) < {e.name for e in Model.of(None, (), (), [recording]).effects}
+    assert set(GEOMETRY[:-1]) < {e.name for e in Model.of(None, (), (), [recording]).effects}
     assert diagnose(whole).verdict == "adequate"
     geometry = whole.solution.shared.effects["arm_geometry"]
     at = {
