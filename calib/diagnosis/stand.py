@@ -32,7 +32,6 @@ from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.levels import Level
 from calib.residuals.scan import ScanStop
-from calib.residuals.seen import SeenBody
 from calib.residuals.tracker import TrackedBody
 from calib.results.intervals import Intervals, intervals
 from calib.results.sigmas import TOLERATED
@@ -72,14 +71,17 @@ class Stand:
         return BeamScatter.of(self.estimate)
 
     @cached_property
-    def misfit(self) -> dict[str, float]:
-        """Of each instrument that sees bodies, rms of its whitened residuals."""
-        squares: dict[str, list[np.ndarray]] = {}
-        for block in self.problem.blocks:
-            if isinstance(block, SeenBody):
-                rows, _ = block.whitened(self.estimate.values, False)
-                squares.setdefault(block.kind, []).append(np.square(rows).ravel())
-        return {kind: float(np.sqrt(np.concatenate(s).mean())) for kind, s in squares.items()}
+    def levels_err_most(self) -> bool:
+        """Whether levels fit worse than their sigmas allow, and worse than what the tracker sees:
+        they, or what they are mounted on, err then, and no body."""
+        if all(block.kind != Level.kind for block in self.problem.seen):
+            return False
+        squares: dict[str, list[np.ndarray]] = {Level.kind: [], TrackedBody.kind: []}
+        for block in self.problem.seen:
+            rows, _ = block.whitened(self.estimate.values, False)
+            squares[block.kind].append(np.square(rows).ravel())
+        off = {kind: np.sqrt(np.concatenate(some).mean()) for kind, some in squares.items() if some}
+        return bool(off[Level.kind] > max(TOLERATED, off.get(TrackedBody.kind, 0.0)))
 
     @cached_property
     def spent(self) -> int:
@@ -279,11 +281,10 @@ class Look:
 
     @cached_property
     def chance(self) -> list[Chance]:
-        """What may scatter by chance, that which chance explains least first. Where levels fit
-        worse than what the tracker sees, they or what they are mounted on err, and no body."""
-        off = self.stand.misfit
-        if off.get(Level.kind, 0.0) > max(TOLERATED, off.get(TrackedBody.kind, 0.0)):
-            return ranked([*self.values])
+        """What may scatter by chance, that which chance explains least first; rows of no body where
+        levels err most."""
+        if self.stand.levels_err_most:
+            return ranked(self.values)
         wider = [e for e in self.by_rows if e.widens]
         posed = [e for e in self.by_rows if not e.widens]
         of_rows = rows_by_chance(wider, self.blunders, self.others)

@@ -51,7 +51,7 @@ COLUMN_WORDS = {
     "waited.s": "how long the arm waits",
     "temperature_c": "temperature",
     "joints": "the arm's pose",
-    "tracked": "where the tracked bodies stand",
+    "tracked": "the place of the tracked bodies",
     "intensity": "intensity",
 }
 

@@ -184,9 +184,7 @@ class JointScatter(Scatter):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         """None where the joints count as exact."""
-        joints = zip(rig.joint_names, rig.joint_kinds, strict=True) if rig.sigma_joint_rad else ()
-        units = {name: "rad" if kind == "revolute" else "m" for name, kind in joints}
-        return self.params_of_each(units)
+        return self.params_of_each(rig.joint_units if rig.sigma_joint_rad else {})
 
     def basis(self, view: View) -> np.ndarray:
         return self.several(view, view.joints.shape[1])

@@ -32,7 +32,7 @@ FAR_WORSE = 2.0
 # may lie a little beyond.
 BEYOND_SPAN = 0.1
 BEYOND_MODEL = (
-    "a prediction holds what the model knows: stops held out are off by {:.2f} mm rms, where "
+    "a prediction covers only what the model knows: stops held out are off by {:.2f} mm rms, where "
     "{:.2f} mm is expected"
 )
 TOLD_SHARE = 0.95  # of errors that lie below what is told
@@ -81,7 +81,7 @@ class Reach:
 
     def document(self, summary: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """As summary.json, of a fit, holds it. Where stops held out are further off than they
-        should be, the model lacks something, and what is predicted does not hold that."""
+        should be, the model lacks something, and what is predicted does not cover that."""
         told = [self.sentence, *([self.warning] if self.is_small else [])]
         rms_mm = summary["rms_mm"] if summary else {}
         held_out, expected = rms_mm.get("held_out"), rms_mm.get("noise_floor")

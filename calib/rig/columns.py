@@ -92,16 +92,16 @@ def up_in_root(rig: Rig, recording: RecordedStops) -> np.ndarray:
         for frame, felt in recording.levels.items()
     ]
     if not said and rig.levels.up and rig.tracker:
-        said = [in_root(rig, recording, rig.levels.up)]
+        said = [direction_in_root(rig, recording, rig.levels.up)]
     up = np.nansum([np.full((len(recording.stops), 3), np.nan), *said], axis=0)
     elsewhere = up.sum(axis=0) if up.any() else UPRIGHT
     up = np.where(up.any(axis=1, keepdims=True), up, elsewhere)
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-def in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
-    """As `in_root_at`, on median for as long as the rig stands still."""
-    there = in_root_at(rig, recording, direction)
+def direction_in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
+    """As `direction_in_root_at`, on median for as long as the rig stands still."""
+    there = direction_in_root_at(rig, recording, direction)
     places = recording.location if rig.moves == "location" else np.zeros(len(there), int)
     for place in np.unique(places) if rig.moves != "stop" else ():
         some = there[places == place]
@@ -110,7 +110,9 @@ def in_root(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> n
     return there / np.linalg.norm(there, axis=1, keepdims=True)
 
 
-def in_root_at(rig: Rig, recording: RecordedStops, direction: Sequence[float]) -> np.ndarray:
+def direction_in_root_at(
+    rig: Rig, recording: RecordedStops, direction: Sequence[float]
+) -> np.ndarray:
     """Unit vectors (K, 3) in the root's frame that point where a direction (3,) does in the
     tracker's, the rig lying at each stop as the body with the fewest joints before it says; NaN
     where that is not seen."""

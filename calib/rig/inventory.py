@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.rig import Rig
-from calib.rig.columns import PAYLOAD, in_root_at, up_in_root
+from calib.rig.columns import PAYLOAD, direction_in_root_at, up_in_root
 from calib.rig.suspect import listed
 from sensors.recording import RecordedStops
 from sensors.reference import Reference
@@ -298,7 +298,7 @@ def _leans(rig: Rig, recording: RecordedStops) -> Iterator[str]:
     if not rig.masses or rig.tracker is None or (rig.levels and rig.levels.frames):
         return
     ups = [rig.levels.up] if rig.levels else OFTEN_UP
-    there = np.stack([in_root_at(rig, recording, up) for up in ups], axis=1)
+    there = np.stack([direction_in_root_at(rig, recording, up) for up in ups], axis=1)
     there = there[np.isfinite(there[:, 0, 0])]
     mean = there.sum(axis=0) / max(len(there), 1)
     size = np.linalg.norm(mean, axis=1)

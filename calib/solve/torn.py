@@ -136,8 +136,8 @@ def _stands(problem: Problem, scan: ScanStop, values: Values) -> Iterator[tuple[
     for block in problem.bodies:
         if key_of(scan) in block.stop_names and not block.is_point:
             k = block.stop_names.index(key_of(scan))
-            T_root_body = block.stops.from_stand(block.body, values, False).T
-            T = T_root_body[k if len(T_root_body) > 1 else 0]
+            T_stood_body = block.stops.from_stand(block.body, values, False).T
+            T = T_stood_body[k if len(T_stood_body) > 1 else 0]
             yield block.groups[k], block.measured[k] @ se3.inverse(T)
 
 

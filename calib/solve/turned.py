@@ -87,16 +87,16 @@ class _Group:
         roots = [b.stops.root for b in together.blocks for _ in b.measured]
         whole = together.whole
         joints = len(whole.stops.rig.joints_to(whole.body))
-        moved = _in_root(whole, values).d.items()
+        moved = _from_stand(whole, values).d.items()
         return cls(whole, roots, joints, felt=frozenset(name for name, d in moved if d.any()))
 
     def place(self, values: Values) -> np.ndarray:
-        """T_root_body (K, 4, 4)."""
-        return _in_root(self.whole, values).T
+        """T_stood_body (K, 4, 4)."""
+        return _from_stand(self.whole, values).T
 
 
-def _in_root(body: TrackedBody, values: Values) -> Placed:
-    """T_root_body, what encoders misreport at single stops left out."""
+def _from_stand(body: TrackedBody, values: Values) -> Placed:
+    """T_stood_body, what encoders misreport at single stops left out."""
     stops = body.stops
     own = {stops.noise: np.zeros(stops.joints.shape)} if stops.noise else {}
     return stops.from_stand(body.body, {**values, **own})

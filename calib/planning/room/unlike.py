@@ -72,8 +72,8 @@ def _quantities(source: Source, poses: Poses) -> Iterator[tuple[str, bool, str, 
     if frame:
         T = poses.Ts_world_root @ rig.tree.place(frame, poses.joints).Ts_root_frame
         yield frame, True, "rad", np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0))
-    for k, (name, kind) in enumerate(zip(rig.joint_names, rig.joint_kinds, strict=True)):
-        yield name, False, "rad" if kind == "revolute" else "m", poses.joints[:, k]
+    for (name, unit), joint in zip(rig.joint_units.items(), poses.joints.T, strict=True):
+        yield name, False, unit, joint
 
 
 def _beyond(
