@@ -11,6 +11,7 @@ from calib.effects import CATALOGUE, Effect, Site
 from calib.problem.build import shapes_of
 from calib.problem.model import Model, Source
 
+FINER = 9  # shapes between the two of a grid beside the best one: a choice
 NO_MASSES = "the masses of the arm's links (inertial/mass in its URDF)"
 
 
@@ -98,7 +99,7 @@ def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
     """An effect in finer shapes between those of a grid beside its own, which is one of them."""
     i = grid.index(effect.shape)
     ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, effect.finer)
+    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
     spaced = np.rint(spaced) if effect.whole else spaced
     shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
     return [effect.at(shape) for shape in sorted(shapes)]

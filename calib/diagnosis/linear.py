@@ -21,6 +21,7 @@ from calib.linear.layout import Layout, positions
 from calib.linear.linearise import linearise
 from calib.linear.own import OwnRows, own_rows
 from calib.linear.system import Linearisation
+from calib.outputs.journal import Journal
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
 from calib.residuals.compiled import add_at
@@ -174,6 +175,7 @@ def linearise_with(
         layout=layout,
         gradients=gradients,
         own=own,
+        journal=Journal(),
         progress=lambda done, total: progress("testing what is missing", done, total),
     )
     information, raw = linear.kept[:-1, :-1].copy(), linear.raw

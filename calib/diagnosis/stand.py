@@ -313,19 +313,21 @@ class Look:
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
         """A look at one candidate alone, in finer shapes between those of the grid beside its own;
         and the best of them, whose p-value is to be adjusted for these shapes as well."""
-        stand, effect = self.stand, candidate.effect
-        if not effect.shape_name:
-            return self, candidate
-        shaped = finer(effect, shapes_of(effect, stand.sources))
-        shaped = [each for each in shaped if each.name not in stand.model.names]
-        linear, at, _ = stand.linearise(shaped, progress)
-        scores = project(linear, linear.candidates, stand.spent)
-        near = screen(scores, shaped, at, self.named.common)
-        if not near.candidates:
-            return self, candidate
-        (finest,) = near.candidates
-        found = replace(finest, looks=finest.looks * candidate.looks)
-        return replace(self, linear=linear, named=near), found
+        stand, near = self.stand, self
+        grid = shapes_of(candidate.effect, stand.sources)
+        for _ in range(candidate.effect.refined if candidate.effect.shape_name else 0):
+            shaped = finer(candidate.effect, grid)
+            grid = [each.shape for each in shaped]
+            shaped = [each for each in shaped if each.name not in stand.model.names]
+            linear, at, _ = stand.linearise(shaped, progress)
+            scores = project(linear, linear.candidates, stand.spent)
+            named = screen(scores, shaped, at, self.named.common)
+            if not named.candidates:
+                break
+            (finest,) = named.candidates
+            near = replace(self, linear=linear, named=named)
+            candidate = replace(finest, looks=finest.looks * candidate.looks)
+        return near, candidate
 
     def with_shape(
         self, candidate: Candidate, near: Look, finest: Candidate

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from calib.linear.own import OwnRows, own_rows
 from calib.linear.parallel import over_stops
 from calib.linear.rows import State, StopRows, StopSums, Weighing
 from calib.linear.system import Linearisation, Values
+from calib.outputs.journal import Journal
 from calib.problem import Problem
 from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
@@ -37,6 +38,7 @@ def linearise(
     weighed: Sequence[Weighing] = (),
     slowed: Sequence[Weighing] = (),
     own: Sequence[OwnRows] | None = None,
+    journal: Journal | None = None,
 ) -> Linearisation:
     """Linearise all rows of beams and tracked bodies at a state.
 
@@ -53,6 +55,8 @@ def linearise(
         slowed: how they were weighed before, if robust scales are to go but half the way on, or
             to stay.
         own: the rows about stops' own unknowns, as `own_rows` has them, where they are known.
+        journal: keeps what each stop adds, which follows from the state and from what was asked
+            before; where it is worth that.
     """
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
@@ -61,9 +65,9 @@ def linearise(
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
     work = partial(_of_stop, layout, State(values), newton, gradients is not None)
-    asked = placed, associations, slowed or [None] * count, weighed or [None] * count
+    each = placed, associations, slowed or [None] * count, weighed or [None] * count
     found: list[_OfStop] = []
-    for i, stop in enumerate(over_stops(work, scans, *asked)):
+    for i, stop in enumerate(_of_stops(work, scans, each, values, journal)):
         progress(i, count)
         found.append(stop.without_sums())
         assembly.add(stop.sums)
@@ -120,6 +124,27 @@ class _OfStop:
     def without_sums(self) -> _OfStop:
         """What is kept of it until all stops are done."""
         return replace(self, sums=None, scatter=None, met=None, gradients=())
+
+
+def _of_stops(
+    work: Callable[..., _OfStop],
+    scans: Sequence[ScanStop],
+    each: Sequence[Sequence[Any]],
+    values: Values,
+    journal: Journal | None,
+) -> Iterator[_OfStop]:
+    """What stops add at a state, in their order; as a journal knows it, if there is one."""
+
+    def of(some: Sequence[int]) -> Iterator[_OfStop]:
+        return over_stops(work, [scans[i] for i in some], *([x[i] for i in some] for x in each))
+
+    if journal is None:
+        return of(range(len(scans)))
+    stops = [f"{i} {scan.name}" for i, scan in enumerate(scans)]
+    return journal.each(values, stops, of, KEPT_OF_STOP)
+
+
+KEPT_OF_STOP = _OfStop, StopSums, KeptSums, Weighing, State
 
 
 def _of_stop(

@@ -25,6 +25,7 @@ from calib.residuals.scan import ScanStop
 PLACES = ("surface", "plane")  # beams that meet the same one share its error
 TWIST = 6  # columns of a stop's rows that come first; minus the residual is the next
 BLOCK = 8192  # rows that are weighted at once: bounds the memory
+STACKED_ROWS = 1024  # rows that are put together at once: those of 200 columns fit a core's cache
 ZERO = "range_offset"  # the effect that lengthens all ranges alike
 
 
@@ -143,7 +144,7 @@ class StopRows:
             last, start = start, start + len(used)
         return cls(
             stop=layout.stops[key_of(scan)],
-            dense=np.hstack([rows.by_twist, -residual[:, None], *rows.dense.values()]),
+            dense=_beside([rows.by_twist, -residual[:, None], *rows.dense.values()]),
             weight=weight,
             index=index,
             value=value,
@@ -289,6 +290,17 @@ class StopSums:
         both[:count] += self.with_sparse
         both[:, :count] += self.with_sparse.T
         return np.block([[self.dense, self.with_dense.T], [self.with_dense, both]])
+
+
+def _beside(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Columns (N, …) beside each other, so many rows at once: a few columns of all rows are few
+    numbers in each line of memory that they touch."""
+    ends = np.cumsum([each.shape[1] for each in columns])
+    out = np.empty((len(columns[0]), ends[-1]))
+    for at in range(0, len(out), STACKED_ROWS):
+        for each, end in zip(columns, ends.tolist(), strict=True):
+            out[at : at + STACKED_ROWS, end - each.shape[1] : end] = each[at : at + STACKED_ROWS]
+    return out
 
 
 def _gram(dense: np.ndarray, weight: np.ndarray) -> np.ndarray:

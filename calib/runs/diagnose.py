@@ -28,6 +28,7 @@ from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_di
 from calib.effects import own_effects
 from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
+from calib.outputs.journal import going_on
 from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
@@ -43,7 +44,7 @@ from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
 from calib.runs.belief import cautions, forbids, over_floor
-from calib.runs.reopen import model_of, reopened, start_of, state_of
+from calib.runs.reopen import identity, model_of, reopened, start_of, state_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress, resume
 from calib.solve.otherwise.rooms import rooms_turned
@@ -70,16 +71,16 @@ def diagnose(
         InputError: the recordings are not what they were, or a file of effects is wrong.
     """
     with outputs.entries(run.folder, outputs.RUN) as entries:
-        result = _found(run, staged(progress, DIAGNOSE_STAGES), refits, candidates)
+        stand = stand_of(run, progress := staged(progress, DIAGNOSE_STAGES), candidates)
+        asked = {**identity(run), "refits": refits, "own": [e.document() for e in stand.own]}
+        with going_on(outputs.kept(entries, asked)):
+            result = _found(run, stand, refits, progress)
         write_json(entries / DIAGNOSIS, result.document())
     return result
 
 
-def _found(
-    run: Run, progress: Progress, refits: bool, candidates: str | Sequence[str]
-) -> Diagnosis:
+def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
-    stand = stand_of(run, progress, candidates)
     rings = ((s.rig.lidar.name, each) for s, each in odd_rings(stand.sources))
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
     # rejected for no reason of their own, and groups far out that are not to blame.
