@@ -24,6 +24,7 @@ from calib.linear.system import Linearisation
 from calib.outputs.journal import Journal
 from calib.problem.problem import Problem
 from calib.problem.unknowns import Owner
+from calib.residuals.beams import Association
 from calib.residuals.compiled import add_at
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
@@ -155,7 +156,11 @@ def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.nda
 
 
 def linearise_with(
-    wide: Problem, estimate: Estimate, candidates: Sequence[str], progress: Progress
+    wide: Problem,
+    estimate: Estimate,
+    candidates: Sequence[str],
+    progress: Progress,
+    most: int | None = None,
 ) -> Linear:
     """Linearise a problem that holds candidates beside the model, at the model's solution.
 
@@ -164,14 +169,16 @@ def linearise_with(
         estimate: the model's solution.
         candidates: unknowns that the model does not have; they have no prior here.
         progress: called with what is being done, how many stops are done, and of how many.
+        most: about how many beams of each scan, at most, for a first answer; all where None.
     """
     wide, values = beside(wide, estimate)
+    wide, associations = _drawn(wide, estimate.associations, most)
     layout = Layout.of(wide, unbounded=candidates)
     gradients, own = Gradients(layout.size), own_rows(layout, values)
     linear = linearise(
         wide,
         values,
-        estimate.associations,
+        associations,
         layout=layout,
         gradients=gradients,
         own=own,
@@ -205,6 +212,18 @@ def linearise_with(
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=replace(linear, raw=None, layout=replace(layout, bodies=(), others=())),  # all here
     )
+
+
+def _drawn(
+    problem: Problem, associations: Sequence[Association], most: int | None
+) -> tuple[Problem, Sequence[Association]]:
+    """A problem with about so many beams of each scan, drawn from those on each surface, and what
+    they meet; all where None."""
+    if most is None:
+        return problem, associations
+    met = zip(problem.scans, associations, strict=True)
+    some = [scan.some(association, most) for scan, association in met]
+    return replace(problem, scans=[s for s, _, _ in some]), [a for _, a, _ in some]
 
 
 def _add_others(

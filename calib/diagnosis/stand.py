@@ -43,6 +43,7 @@ from sensors.holds import spread_known
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
+REFINING_BEAMS = 4_096  # of a scan, to find between which shapes the best is: a choice
 
 
 @dataclass(frozen=True)
@@ -166,13 +167,15 @@ class Stand:
         )
 
     def linearise(
-        self, candidates: Sequence[Effect], progress: Progress
+        self, candidates: Sequence[Effect], progress: Progress, most: int | None = None
     ) -> tuple[Linear, dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
-        """All rows with these candidates beside the model; each one's columns among theirs; and the
-        same apart for each of its unknowns, of which every rig may have one."""
+        """All rows with these candidates beside the model, or about so many of each scan at most;
+        each one's columns among theirs; and the same apart for each of its unknowns, of which every
+        rig may have one."""
         wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = variables_of(wide, {e.name for e in candidates})
-        linear = linearise_with(wide, self.estimate, [*chain(*variables.values())], progress)
+        every = [*chain(*variables.values())]
+        linear = linearise_with(wide, self.estimate, every, progress, most)
         at, start = {}, 0
         for name, theirs in variables.items():
             ends = start + np.cumsum([0, *(wide.variables[v].dim for v in theirs)])
@@ -312,14 +315,15 @@ class Look:
 
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
         """A look at one candidate alone, in finer shapes between those of the grid beside its own;
-        and the best of them, whose p-value is to be adjusted for these shapes as well."""
+        and the best of them, whose p-value is to be adjusted for these shapes as well. Some beams
+        say between which shapes of a finer grid those of the next one are."""
         stand, near = self.stand, self
-        grid = shapes_of(candidate.effect, stand.sources)
-        for _ in range(candidate.effect.refined if candidate.effect.shape_name else 0):
+        grid, times = shapes_of(candidate.effect, stand.sources), candidate.effect.refined
+        for left in reversed(range(times if candidate.effect.shape_name else 0)):
             shaped = finer(candidate.effect, grid)
             grid = [each.shape for each in shaped]
             shaped = [each for each in shaped if each.name not in stand.model.names]
-            linear, at, _ = stand.linearise(shaped, progress)
+            linear, at, _ = stand.linearise(shaped, progress, REFINING_BEAMS if left else None)
             scores = project(linear, linear.candidates, stand.spent)
             named = screen(scores, shaped, at, self.named.common)
             if not named.candidates:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from calib.intake.still import MIN_HOLD_S, find_holds
 from calib.intake.surface import write_surface
 from calib.results.check import Check, check
 from calib.rig import load_rig
+from calib.runs.run import versions
 from chains.errors import InputError, is_file_name, shortened
 from sensors.documents import write_atomically
 from sensors.readers.base import Columns, Options, Progress
@@ -134,7 +135,9 @@ def import_files(
         write_columns(folder / "stops.csv", _ordered(columns))
         if share:
             _check_names(columns["stop"].tolist())
-            odd += scans.write(folder / "scans", columns["stop"].tolist(), share, progress)
+            kept = outputs.kept(folder, _asked(inputs, options, choices))
+            names = columns["stop"].tolist()
+            odd += scans.write(folder / "scans", names, share, kept, progress)
         rods, more = targets.join(gathered.spheres, gathered.tracks)
         odd += more
         if rods is not None:
@@ -142,7 +145,7 @@ def import_files(
         checked = check(folder, progress, graph=len(columns["stop"]) <= MOST_CHECKED)
         if checked.problems:
             raise InputError(checked.problems[0])
-    return Imported(out, understood, odd, checked)
+    return Imported(out, understood, odd, replace(checked, folder=out))
 
 
 def _inputs(given: Sequence[Given], options: Options, choices: Choices) -> list[Path]:
@@ -150,6 +153,18 @@ def _inputs(given: Sequence[Given], options: Options, choices: Choices) -> list[
     files = [path for _, paths in given for path in paths]
     named = (choices.rig, options.metadata, options.lidar)
     return [*files, *options.packages.values(), *(Path(each) for each in named if each)]
+
+
+def _asked(inputs: Sequence[Path], options: Options, choices: Choices) -> dict[str, Any]:
+    """All that scans depend on, as JSON holds it: what was asked, and files by their size and time,
+    as logs are too long to be read once more."""
+    files = [f for path in inputs for f in (sorted(path.rglob("*")) if path.is_dir() else [path])]
+    stats = [(file, file.stat()) for file in files if file.is_file()]  # no model of the catalogue
+    return {
+        "files": [[str(file.absolute()), s.st_size, s.st_mtime_ns] for file, s in stats],
+        "options": [repr(options), repr(choices)],
+        "versions": versions(),
+    }
 
 
 @contextmanager

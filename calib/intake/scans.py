@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from calib import outputs
 from calib.intake.gather import finite_times
 from calib.rig.suspect import listed
 from chains.errors import InputError
 from sensors.readers.base import Progress, Sweep, Sweeps
-from sensors.recording import write_table
+from sensors.recording import table_bytes
 
 Share = list[tuple[Sweeps, np.ndarray]]
 """Of each `Sweeps`, the stop (S,) of every turn, -1 where it belongs to none."""
@@ -86,26 +87,45 @@ def one_lidar(sweeps: Sequence[Sweeps]) -> None:
             )
 
 
-def write(folder: Path, stops: Sequence[str], share: Share, progress: Progress) -> list[str]:
+def write(
+    folder: Path, stops: Sequence[str], share: Share, kept: outputs.Kept, progress: Progress
+) -> list[str]:
     """Write a scan for every stop that has points, each with the number of its turn in `scan`; what
     looked odd.
+
+    Args:
+        folder: to be made, for the scans.
+        stops: their names.
+        share: the turns of each.
+        kept: the scans that an import had written before it was killed.
+        progress: called with what is being done, and how far it is.
 
     Raises:
         InputError: no turn has any point, or as readers do while they decode.
     """
     folder.mkdir()
-    total = sum(int((stop >= 0).sum()) for _, stop in share)
+    share = sorted(share, key=lambda entry: _first(entry[1]))
+    every = [k for _, stop in share for k in stop[stop >= 0].tolist()]
+    order, total = [k for k, _ in itertools.groupby(every)], len(every)
 
-    def told() -> Iterator[tuple[int, Sweep]]:
-        for done, each in enumerate(_in_turn(share)):
-            progress("writing scans", done, total)
-            yield each
+    def work(some: Sequence[int]) -> Iterator[outputs.Finished]:
+        lacking = {order[i] for i in some}
+        done = total - sum(k in lacking for k in every)
 
-    empty = [
-        stops[k]
-        for k, turns in itertools.groupby(told(), key=lambda each: each[0])
-        if not _write_one(folder, stops[k], [sweep for _, sweep in turns])
-    ]
+        def told() -> Iterator[tuple[int, Sweep]]:
+            for more, turn in enumerate(_in_turn(share, lacking)):
+                progress("writing scans", done + more, total)
+                yield turn
+
+        for _, turns in itertools.groupby(told(), key=lambda turn: turn[0]):
+            yield _scan([sweep for _, sweep in turns])
+
+    empty = []
+    for k, part in zip(order, kept.each("scans to write", len(order), work), strict=True):
+        if part.told["points"]:
+            part.put(folder / f"{stops[k]}.parquet")
+        else:
+            empty.append(stops[k])
     if empty and not any(folder.iterdir()):
         raise InputError(
             f"none of {total} turns of the LiDAR has a point: every return is missing, or nearer "
@@ -114,19 +134,21 @@ def write(folder: Path, stops: Sequence[str], share: Share, progress: Progress) 
     return [f"stop {listed(empty)}: turns without any point, so no scan"] if empty else []
 
 
-def _in_turn(share: Share) -> Iterator[tuple[int, Sweep]]:
-    """Turns and their stops, stop by stop as long as each source is in order of time."""
-    for one, stop in sorted(share, key=lambda entry: _first(entry[1])):
-        wanted = stop >= 0
-        yield from zip(stop[wanted].tolist(), one.read(wanted), strict=True)
+def _in_turn(share: Share, some: Collection[int]) -> Iterator[tuple[int, Sweep]]:
+    """Turns of some stops, and their stops, stop by stop as long as each source is in order of
+    time."""
+    for one, stop in share:
+        wanted = np.isin(stop, list(some))
+        if wanted.any():
+            yield from zip(stop[wanted].tolist(), one.read(wanted), strict=True)
 
 
 def _first(stop: np.ndarray) -> int:
     return int(stop[stop >= 0].min(initial=np.iinfo(int).max))
 
 
-def _write_one(folder: Path, stop: str, sweeps: Sequence[Sweep]) -> bool:
-    """Write the turns of a stop; whether they have any point."""
+def _scan(sweeps: Sequence[Sweep]) -> outputs.Finished:
+    """The turns of a stop as its file holds them, and whether they have any point."""
     names = set.intersection(*(set(sweep.points) for sweep in sweeps))
     points = {
         name: np.concatenate([sweep.points[name] for sweep in sweeps])
@@ -135,6 +157,5 @@ def _write_one(folder: Path, stop: str, sweeps: Sequence[Sweep]) -> bool:
     sizes = [len(sweep.points["x"]) for sweep in sweeps]
     if len(sweeps) > 1:
         points["scan"] = np.repeat(np.arange(len(sweeps), dtype=np.uint16), sizes)
-    if len(points["x"]):
-        write_table(folder / f"{stop}.parquet", points)
-    return len(points["x"]) > 0
+    there = len(points["x"]) > 0
+    return {"points": there}, table_bytes(points) if there else b""

@@ -80,6 +80,7 @@ def apart(found, true):
 def test_holds_clocks_and_a_first_rig(files, tmp_path):
     out = tmp_path / "rec"
     done = bring(files, out, "table log.csv tum cup.txt dh arm.yaml")
+    assert done.check.folder == out  # which what it advises to type names
     table = stops_of(out)
     found = np.array([table[name] for name in JOINTS], float).T
     np.testing.assert_allclose(found, HELD, atol=1e-6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib.intake import scans, targets
+from calib.outputs.parts import Kept
 from chains.errors import InputError
 from sensors.readers.base import Spheres, Sweep, Sweeps, Track
 from sensors.recording import read_table
@@ -26,8 +27,13 @@ def turns(time_s, name="top", first=0):
     return Sweeps(name, name, np.asarray(time_s, float), read)
 
 
+def write(folder, share):
+    folder.parent.mkdir(exist_ok=True)
+    return scans.write(folder, STOPS, share, Kept(folder.with_name("kept")), lambda *a: None)
+
+
 def written(folder, share):
-    scans.write(folder, STOPS, share, lambda *a: None)
+    write(folder, share)
     return {path.stem: read_table(path) for path in folder.iterdir()}
 
 
@@ -52,6 +58,38 @@ def test_holds_without_turns_are_said_and_none_is_refused():
     assert "2 of 3 holds" in scans.by_time([turns([0.5])], SPANS)[1][0]
     with pytest.raises(InputError, match="--clock-offset"):
         scans.by_time([turns([9.5])], SPANS)
+
+
+def test_scans_of_an_import_that_was_killed_are_not_read_again(tmp_path):
+    """From several files, of which the second fails in its last turn."""
+    files = [turns([0.5, 0.9, 2.5], "early"), turns([2.6, 5.5, 5.6], "late", 10)]
+    share, _ = scans.by_time(files, SPANS)
+    whole = written(tmp_path / "whole/scans", share)
+    asked = []
+
+    def failing(one, at):
+        def read(wanted):
+            for k, sweep in zip(np.flatnonzero(wanted), one.read(wanted), strict=True):
+                asked.append((one.name, int(k)))
+                if (one.name, k) == at:
+                    raise KeyboardInterrupt
+                yield sweep
+
+        return Sweeps(one.name, one.clock, one.time_s, read)
+
+    def read_from(at):
+        asked.clear()
+        return [(failing(one, at), stop) for one, stop in share]
+
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "cut/scans", read_from(("late", 2)))
+    (tmp_path / "cut/scans").rename(tmp_path / "gone")
+    found = written(tmp_path / "cut/scans", read_from(None))
+    assert asked == [("late", 1), ("late", 2)]  # the last hold's
+    assert found.keys() == whole.keys() == set(STOPS)
+    for stop, columns in whole.items():
+        for name, values in columns.items():
+            np.testing.assert_array_equal(found[stop][name], values)
 
 
 def test_two_lidars_at_once_are_refused():
@@ -107,9 +145,7 @@ def test_turns_without_any_point_are_told_and_a_recording_of_them_is_refused(tmp
 
     each = turns([0.5, 2.5, 5.5])
     share, _ = scans.by_time([emptied(each, {1})], SPANS)
-    assert scans.write(tmp_path / "some", STOPS, share, lambda *a: None) == [
-        "stop b: turns without any point, so no scan"
-    ]
+    assert write(tmp_path / "some/scans", share) == ["stop b: turns without any point, so no scan"]
     share, _ = scans.by_time([emptied(each, {0, 1, 2})], SPANS)
     with pytest.raises(InputError, match="none of 3 turns"):
-        scans.write(tmp_path / "none", STOPS, share, lambda *a: None)
+        write(tmp_path / "none/scans", share)
