@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calib.effects import Site
@@ -17,6 +19,7 @@ from chains import se3
 from chains.errors import InputError
 from sensors.planes import PlaneFinder, Planes
 
+Progress = Callable[[str, int, int], None]
 OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
 # How uneven planes are, region by region and patch by patch: a third of the 3 mm over 1 m that DIN
 # 18202 (table 3, row 7) allows a good wall. A fit starts from it and estimates it, but for what is
@@ -24,10 +27,10 @@ OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
 UNEVEN_M, FLATTEST_M = 1e-3, 5e-5
 
 
-def add_beams(problem: Problem, part: SourceStops, places: Places) -> None:
+def add_beams(problem: Problem, part: SourceStops, places: Places, progress: Progress) -> None:
     """Add every scan of a recording, and the planes' unknowns where there is no mesh."""
     source = part.source
-    meeting = _meeting(problem, part, places)
+    meeting = _meeting(problem, part, places, progress)
     terms = [t for t in part.terms if t.effect.site in OF_BEAMS and not t.effect.widens]
     uneven_m = dict.fromkeys(PLANE_PATCHES_M, UNEVEN_M) if isinstance(meeting, PlaneSurface) else {}
     stated_m = FLATTEST_M if uneven_m else source.rig.reference.sigma_m
@@ -59,7 +62,7 @@ def _room(problem: Problem, part: SourceStops) -> int | str:
     return next(i for i, mesh in enumerate(meshes) if same_mesh(mesh, part.source.reference))
 
 
-def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
+def _meeting(problem: Problem, part: SourceStops, places: Places, progress: Progress) -> Meeting:
     """What the beams meet: the mesh, or else planes found in the scans."""
     found = problem.meetings.get(part.number)
     if found is None:
@@ -71,7 +74,7 @@ def _meeting(problem: Problem, part: SourceStops, places: Places) -> Meeting:
                 {kind: _left_out(part.source, kind) for kind in MESH_PARTS},
             )
             if reference is not None
-            else PlaneSurface(_find_planes(problem, part, places), f"{part.prefix}planes")
+            else PlaneSurface(_find_planes(problem, part, places, progress), f"{part.prefix}planes")
         )
         problem.meetings[part.number] = found
     if isinstance(found, PlaneSurface):
@@ -99,11 +102,13 @@ def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:
     )
 
 
-def _find_planes(problem: Problem, part: SourceStops, places: Places) -> Planes:
+def _find_planes(problem: Problem, part: SourceStops, places: Places, progress: Progress) -> Planes:
     recording, rig = part.source.recording, part.source.rig
     finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
     store = part.source.of_beams(None).store  # the same planes, however many beams are used
-    for k, stops in places.scanned():
+    scanned = list(places.scanned())
+    for i, (k, stops) in enumerate(scanned):
+        progress("looking for planes", i, len(scanned))
         _, ray = store.read(k)
         T = stops.in_reference(rig.lidar_frame, problem.initial, False).T[0]
         points_m = ray.origin_m + ray.range_m[:, None] * ray.direction

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.effects import Effect, ShapeStep, View
 from calib.forward import Term
-from calib.problem.beams import add_beams
+from calib.problem.beams import Progress, add_beams
 from calib.problem.bodies import add_bodies, add_levels, add_targets
 from calib.problem.model import Model, Source, labels
 from calib.problem.places import Places
@@ -32,6 +32,7 @@ def build(
     model: Model,
     use: Sequence[np.ndarray] | None = None,
     meetings: Mapping[int, Meeting] | None = None,
+    progress: Progress = lambda what, done, total: None,
 ) -> Problem:
     """The problem of a model on its recordings.
 
@@ -40,6 +41,7 @@ def build(
         model: what is estimated.
         use: per source, (K,) bool, which stops take part; all where None.
         meetings: per source, what beams meet, where another problem has found that already.
+        progress: called with what is being done, how many stops are done, and of how many.
 
     Raises:
         InputError: the recording has nothing to start from, lacks what an effect needs, or leaves
@@ -76,7 +78,7 @@ def build(
         add_targets(problem, part, places)
         add_levels(problem, part, places)  # rods show where down is whatever the rig's pose
         if part.has_lidar:
-            add_beams(problem, part, places)
+            add_beams(problem, part, places, progress)
     if not problem.calibration:
         raise InputError(
             f"{sources[0].rig.name}: there is nothing to estimate: no frame with a sigma, no arm "

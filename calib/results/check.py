@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -208,9 +209,9 @@ class _Checker:
 
     def _try_graph(self, source: Source, scans: ScanSums) -> None:
         """Build the graph and linearise it once, without scans that are a problem already."""
-        problem = self._attempt(
-            problems.build, [source], Model.of(None, (), (), [source.recording.folder])
-        )
+        model = Model.of(None, (), (), [source.recording.folder])
+        build = partial(problems.build, progress=self.progress)
+        problem = self._attempt(build, [source], model)
         if problem is None:
             return
         readable = [scan for scan in problem.scans if scan.name in scans.points]

@@ -25,19 +25,19 @@ class Stage:
 
 
 FIT = (
-    Stage("estimate", ("looking for depth edges", "pass "), 0.62),
+    Stage("estimate", ("looking for", "pass "), 0.62),
     Stage("sigmas", ("errors in common of rows",), 0.11),
     Stage("held-out error", ("without ",), 0.19),
     Stage("residuals", ("residuals of beams", "writing residuals"), 0.08),
 )
 DIAGNOSE = (
-    Stage("tests", ("testing", "looking for depth edges", "fitting", "pass "), 0.67),
+    Stage("tests", ("testing", "looking for", "fitting", "pass "), 0.67),
     Stage("rejected beams", ("looking at what was rejected",), 0.02),
     Stage("held-out error", ("without ",), 0.05),
     Stage("formulas", ("reading residuals", "searching covariates"), 0.26),
 )
 PLAN = (
-    Stage("what is known", ("looking for depth edges", "pass "), 0.08),
+    Stage("what is known", ("looking for", "pass "), 0.08),
     Stage("candidates", ("looking at candidates",), 0.75),
     Stage("choice", ("choosing", "how many are enough"), 0.06),
     Stage("what would be found", ("what would be found",), 0.11),

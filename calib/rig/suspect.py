@@ -3,7 +3,7 @@ stop."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +37,7 @@ class Suspect:
         return [fields | {"stop": stop} for stop in (*self.stops,) or (None,)]
 
 
+MOST_ALONE = 0.1  # of the stops: a choice; of rows that loggers and trackers spoil it is a few %
 SO_BY_CHANCE = 0.01  # a choice: how often stops each wrong by itself may follow each other so
 
 
@@ -110,6 +111,20 @@ def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> 
         out.append(spell)
         names, bad = [*names[:a], *names[b:]], np.concatenate([bad[:a], bad[b:]])
     return out
+
+
+def rare(found: Sequence[Suspect], of: int) -> Iterator[str | Suspect]:
+    """Stops that are each wrong by themselves, among so many; or one sentence of all of them, as
+    more than a few are no mishaps: something acts on every stop, and shows at some."""
+    if len(found) <= MOST_ALONE * of:
+        yield from found
+        return
+    worst = max(found, key=lambda one: one.size or 0.0)
+    yield (
+        f"{len(found)} of {of} stops stand out, here and there, most of all so: {worst.sentence}. "
+        "So many are hardly a mishap each: does something act at all stops (a lag of the readings, "
+        "a load, a joint that slips)? rigcal fit and rigcal diagnose test for it"
+    )
 
 
 def listed(names: Sequence[Any], most: int = 3, between: str = ", ") -> str:

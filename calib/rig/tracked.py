@@ -25,7 +25,7 @@ from calib.rig.pairs import (
     size_of,
     turns,
 )
-from calib.rig.suspect import Spell, Suspect, listed, spells
+from calib.rig.suspect import Spell, Suspect, listed, rare, spells
 from chains import se3
 from chains.se3 import Array
 from sensors.recording import RecordedStops
@@ -57,7 +57,7 @@ HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far m
 _Met = list[tuple[SeenPair, Array, bool]]  # pairs at a stop, how far off, whether if exchanged
 
 
-def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[Suspect]:
+def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[str | Suspect]:
     """What looks wrong with tracked bodies."""
     if rig.tracker is None:
         return
@@ -361,7 +361,7 @@ def _edge_sigmas(rig: Rig) -> Array:
 
 def _those_that_last(
     rig: Rig, recording: RecordedStops, at_stops: Mapping[str, tuple[Suspect, _Met]]
-) -> Iterator[Suspect]:
+) -> Iterator[str | Suspect]:
     """What is wrong with a body at stops, and once for those that follow each other."""
     alone = {stop: one for stop, (one, _) in at_stops.items()}
     pairs = {pair.names: pair for _, met in at_stops.values() for pair, *_ in met}
@@ -374,7 +374,7 @@ def _those_that_last(
         (worst,) = max(found, key=lambda one: one.size or 0.0).stops
         where = f"{spell}, most of all at {worst},"
         yield _at_one_stop(rig, where, at_stops[worst][1], spell.wrong, f"this {spell.course}")
-    yield from alone.values()
+    yield from rare([*alone.values()], max(len(pair.stops) for pair in pairs.values()))
 
 
 def _at_one_stop(

@@ -239,7 +239,7 @@ def _fit(
     """Estimate, judge by what was held out, and write the run."""
     began, progress = time.monotonic(), staged(progress, FIT)
     before = choices.before
-    problem = problems.build(sources, model)
+    problem = problems.build(sources, model, progress=progress)
     held = earlier(problem, before.solution) if before else None
     links: list[Link] = []
     if held is None:

@@ -394,7 +394,7 @@ def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ())
     """
     sources, model = reopened(run), replace(model_of(run), moved=moved_since_cad(run.summary))
     own = own_effects([source.rig for source in sources], candidates)
-    problem, converged = build(sources, model), run.summary["converged"]
+    problem, converged = build(sources, model, progress=progress), run.summary["converged"]
     state_of(run, problem)  # or it would look from elsewhere, unseen
     estimate = resume(problem, start_of(run, sources), progress, converged)
     return Stand(sources, model, problem, estimate, own=own)

@@ -35,6 +35,15 @@ def fitted(tmp_path_factory):
     return fit
 
 
+def test_a_search_for_planes_says_how_far_it_is(tmp_path):
+    told = []
+    worlds.write(worlds.World(seed=5, locations=1, stops=3, beams=BEAMS), tmp_path / "rec")
+    without_mesh(tmp_path / "rec")
+    source = Source.open(tmp_path / "rec")
+    build([source], Model(), progress=lambda *step: told.append(step))
+    assert told == [("looking for planes", i, 3) for i in range(3)]
+
+
 def without_mesh(folder):
     """Take the mesh and the targets away."""
     shutil.rmtree(folder / "reference")
