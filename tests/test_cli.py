@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from calib.cli import main
-from calib.cli.app import app
+from calib.cli.app import app, heeding_ctrl_c, progress_bar
 
 from .programs import LIMIT_S, RIGCAL, execute, started
 
@@ -255,6 +255,27 @@ def test_progress_is_shown_at_a_terminal_and_never_on_stdout(folder):
 
 
 # ------------------------------------------------------------------------------------------ Ctrl-C
+
+
+class PressesCtrlC:
+    """Once it is freed, where Python drops what is raised."""
+
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_ctrl_c_counts_even_if_python_drops_it():
+    before = signal.getsignal(signal.SIGINT)
+    with heeding_ctrl_c(), progress_bar() as progress:
+        progress("fitting", 0, 2)
+        pressed = PressesCtrlC()
+        del pressed
+        with pytest.raises(KeyboardInterrupt):
+            progress("fitting", 1, 2)
+    with heeding_ctrl_c(), progress_bar() as progress:
+        progress("fitting", 0, 2)  # the next command knows nothing of it
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_an_interrupted_fit_leaves_the_earlier_run_as_it_was(folder):

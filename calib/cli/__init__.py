@@ -30,7 +30,7 @@ from calib.cli import (  # noqa: E402
     planning,  # noqa: F401
     reporting,  # noqa: F401
 )
-from calib.cli.app import app  # noqa: E402
+from calib.cli.app import app, heeding_ctrl_c  # noqa: E402
 from chains.errors import InputError  # noqa: E402
 from chains.escape import terminal  # noqa: E402
 
@@ -57,7 +57,8 @@ def main() -> None:
     """Run the command line: exit code 0 done, 2 bad input or usage, 3 done but not
     converged, 1 a fault of the program."""
     try:
-        code = _command()(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
+        with heeding_ctrl_c():
+            code = _command()(sys.argv[1:] or ["--help"], prog_name="rigcal", standalone_mode=False)
     except InputError as error:
         _fail(str(error), 2)
     except MemoryError:

@@ -6,7 +6,9 @@ import importlib.metadata
 import io
 import logging
 import re
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -52,6 +54,7 @@ app = typer.Typer(
 # Results go there; -q takes everything else that is printed away from it.
 _stdout: TextIO | None = None
 _verbose = False
+_interrupted = False
 
 
 def _print_version(asked: bool) -> None:
@@ -185,8 +188,44 @@ def print_json(document: Any) -> None:
 
 
 @contextmanager
+def heeding_ctrl_c() -> Iterator[None]:
+    """Within, Ctrl-C ends a command even if Python drops its exception, as it does where that comes
+    while an object is being freed: `progress_bar` raises it again at the next step. A shell that
+    wants it ignored has its way."""
+    global _interrupted
+    before, _interrupted = signal.getsignal(signal.SIGINT), False
+    mine = threading.current_thread() is threading.main_thread()  # others may not ask for signals
+    if before is not signal.default_int_handler or not mine:
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        global _interrupted
+        _interrupted = True
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
 def progress_bar() -> Iterator[Progress]:
     """A progress bar on stderr where that is a terminal; else silence, or with -v a line a step."""
+    with _steps_shown() as show:
+
+        def step(what: str, done: int, total: int) -> None:
+            if _interrupted:
+                raise KeyboardInterrupt
+            show(what, done, total)
+
+        yield step
+
+
+@contextmanager
+def _steps_shown() -> Iterator[Progress]:
     if not sys.stderr.isatty():
         yield _line_by_line() if _verbose else lambda what, done, total: None
         return

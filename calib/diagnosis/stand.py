@@ -43,7 +43,9 @@ from sensors.holds import spread_known
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
-REFINING_BEAMS = 4_096  # of a scan, to find between which shapes the best is: a choice
+# Of a scan, to find between which shapes the best is; and what they say so often by chance is not
+# looked at with all beams, as a name needs a p-value some hundred times smaller: choices.
+REFINING_BEAMS, TOO_LIKELY = 4_096, 0.05
 
 
 @dataclass(frozen=True)
@@ -317,21 +319,21 @@ class Look:
         """A look at one candidate alone, in finer shapes between those of the grid beside its own;
         and the best of them, whose p-value is to be adjusted for these shapes as well. Some beams
         say between which shapes of a finer grid those of the next one are."""
-        stand, near = self.stand, self
+        stand, near, finest = self.stand, self, candidate
         grid, times = shapes_of(candidate.effect, stand.sources), candidate.effect.refined
         for left in reversed(range(times if candidate.effect.shape_name else 0)):
-            shaped = finer(candidate.effect, grid)
+            shaped = finer(finest.effect, grid)
             grid = [each.shape for each in shaped]
             shaped = [each for each in shaped if each.name not in stand.model.names]
             linear, at, _ = stand.linearise(shaped, progress, REFINING_BEAMS if left else None)
             scores = project(linear, linear.candidates, stand.spent)
             named = screen(scores, shaped, at, self.named.common)
-            if not named.candidates:
-                break
-            (finest,) = named.candidates
+            if not named.candidates or (left and named.candidates[0].p_value > TOO_LIKELY):
+                return self, candidate
             near = replace(self, linear=linear, named=named)
-            candidate = replace(finest, looks=finest.looks * candidate.looks)
-        return near, candidate
+            (found,) = named.candidates
+            finest = replace(found, looks=found.looks * finest.looks)
+        return near, finest
 
     def with_shape(
         self, candidate: Candidate, near: Look, finest: Candidate

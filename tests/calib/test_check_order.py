@@ -1,13 +1,16 @@
-"""What check sees of numbers that stand in another's place: rings of some scans, times of two."""
+"""What check sees of numbers that stand in another's place, and of rows: rings of some scans, times
+of two, and many rows that stand out."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from calib.rig import load_rig
 from calib.rig.inventory import odd_times
 from calib.rig.recording import Recording
 from calib.rig.scanned import ScanSums, odd_scans
+from calib.rig.tracked import odd_bodies
 from sensors.recording import read_scan
 
 
@@ -45,3 +48,23 @@ def test_two_times_that_are_exchanged(sound):
     time_s[[3, 7]] = time_s[[7, 3]]
     (said,) = odd_times(replace(recording, time_s=time_s))
     assert f"but for {recording.stops[3]} and {recording.stops[7]}," in said
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_a_few_rows_are_mishaps_and_many_are_said_once(shared, count):
+    """What acts at all stops shows at some of them; a fit without these would hide it."""
+    folder = shared / "recordings" / "arm_axes_miss_each_other"
+    rig, recording = load_rig(folder), Recording.open(folder)
+    (body,) = rig.tracker.bodies
+    chance = np.random.default_rng(3)
+    rows = chance.choice(len(recording.stops), count, replace=False)
+    far = chance.uniform(0.03, 0.1, (count, 1)) * np.eye(7)[chance.integers(0, 3, count)]
+    poses = recording.bodies[body].copy()
+    poses[rows] += far
+    found = list(odd_bodies(rig, replace(recording, bodies={body: poses})))
+    if count == 3:
+        assert {one.stops[0] for one in found} == {recording.stops[k] for k in rows}
+    else:
+        assert len(found) == 1 and found[0].startswith(
+            f"40 of {len(recording.stops)} stops stand out"
+        )

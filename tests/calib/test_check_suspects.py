@@ -81,21 +81,6 @@ def test_what_was_done_to_recordings_is_found(shared):
     assert moved.name == f"{BASE} or {MOUNT}"
 
 
-@pytest.mark.parametrize("count", [3, 40])
-def test_a_few_rows_are_mishaps_and_many_are_said_once(shared, count):
-    """What acts at all stops shows at some of them; a fit without these would hide it."""
-    rig, recording = opened(shared, "arm_axes_miss_each_other")
-    (body,) = rig.tracker.bodies
-    chance = np.random.default_rng(3)
-    rows = chance.choice(len(recording.stops), count, replace=False)
-    far = chance.uniform(0.03, 0.1, (count, 1)) * np.eye(7)[chance.integers(0, 3, count)]
-    found = list(odd_bodies(rig, changed(recording, body, rows, lambda pose: pose + far)))
-    if count == 3:
-        assert {one.stops[0] for one in found} == {recording.stops[k] for k in rows}
-    else:
-        assert only(found).startswith(f"40 of {len(recording.stops)} stops stand out")
-
-
 def test_placeholders(sound):
     rig, recording = sound
     a, b = seen_stops(recording, 2)

@@ -364,7 +364,9 @@ def _fitted(
     confirmed what it explains, at that of the other (`sure`)."""
     near, finest = look.closely(candidate, progress)
     test, p = judged(near, finest, progress)
-    if p >= ALPHA_EFFECT and finest.effect.jumps:  # few rows tell of its exact place
+    if (
+        p >= ALPHA_EFFECT and finest.effect.jumps and finest is not candidate
+    ):  # few rows tell of its exact place
         p = min(p, 2.0 * judged(look, candidate, progress)[1])
     p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
     if p >= ALPHA_EFFECT:
