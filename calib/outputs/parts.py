@@ -52,6 +52,10 @@ class Kept:
     def __init__(self, folder: Path) -> None:
         self.folder, self._asked = folder, 0
 
+    def of(self, asked: Mapping[str, Any]) -> Kept:
+        """What is kept of one of several things that a command does, asked for this."""
+        return Kept(self.folder / _key(asked))
+
     def each(
         self,
         name: str,
@@ -112,6 +116,11 @@ def _program() -> str:
     return sha.hexdigest()
 
 
+def _key(asked: Mapping[str, Any]) -> str:
+    everything = json.dumps([plain(asked), _program()], sort_keys=True)
+    return hashlib.sha256(everything.encode()).hexdigest()
+
+
 def kept(draft: Path, asked: Mapping[str, Any]) -> Kept:
     """What a command that was asked the same had done before it was killed, and will have done.
 
@@ -119,9 +128,7 @@ def kept(draft: Path, asked: Mapping[str, Any]) -> Kept:
         draft: the folder to fill, as `calib.outputs.folder` or `entries` gave it.
         asked: all that the parts depend on, as JSON holds it.
     """
-    everything = json.dumps([plain(asked), _program()], sort_keys=True)
-    key = hashlib.sha256(everything.encode()).hexdigest()
-    here = draft.parent / KEPT / key
+    here = draft.parent / KEPT / _key(asked)
     for other in here.parent.glob("*"):
         if other != here:
             shutil.rmtree(other, ignore_errors=True)

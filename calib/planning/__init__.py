@@ -32,8 +32,7 @@ from calib.problem.unknowns import Key
 from calib.results.stages import PLAN as STAGES
 from calib.results.stages import staged
 from calib.runs.asked.factors import prior_of
-from calib.runs.diagnose import stand_of
-from calib.runs.reopen import problem_of
+from calib.runs.reopen import problem_of, stand_of
 from calib.runs.run import MODEL, Run
 from calib.solve.fit import Progress
 from chains import se3

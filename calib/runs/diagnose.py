@@ -25,15 +25,12 @@ from calib.diagnosis.verdict.names import believed
 from calib.diagnosis.verdict.sentences import BAD
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
 from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
-from calib.effects import own_effects
 from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
 from calib.outputs.journal import going_on
-from calib.problem import build
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
 from calib.recalibration.between import moved_between
-from calib.recalibration.links import moved_since_cad
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
@@ -44,9 +41,9 @@ from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
 from calib.runs.belief import cautions, forbids, over_floor
-from calib.runs.reopen import identity, model_of, reopened, start_of, state_of
+from calib.runs.reopen import identity, stand_of
 from calib.runs.run import DIAGNOSIS, Run
-from calib.solve.fit import Progress, resume
+from calib.solve.fit import Progress
 from calib.solve.otherwise.rooms import rooms_turned
 from sensors.documents import write_json
 
@@ -57,6 +54,7 @@ def diagnose(
     progress: Progress = lambda what, done, total: None,
     refits: bool = True,
     candidates: str | Sequence[str] = (),
+    kept: outputs.Kept | None = None,
 ) -> Diagnosis:
     """Find where a run's model fails and which effect it lacks; written to its diagnosis.json.
 
@@ -64,8 +62,9 @@ def diagnose(
         run: a fitted run, with its recordings where they were.
         progress: called with what is being done, and how far it is.
         refits: whether effects found are fitted without the held-out stops too.
-        candidates: files of effects of the user's own, which are tested beside the catalogue as are
-            those that ``rig.yaml`` names; see `calib.effects.load_effects`.
+        candidates: files of effects of the user's own, tested beside the catalogue and those that
+            ``rig.yaml`` names; see `calib.effects.load_effects`.
+        kept: what to go on from, and to add to; beside the run until it is done where None.
 
     Raises:
         InputError: the recordings are not what they were, or a file of effects is wrong.
@@ -73,7 +72,7 @@ def diagnose(
     with outputs.entries(run.folder, outputs.RUN) as entries:
         stand = stand_of(run, progress := staged(progress, DIAGNOSE_STAGES), candidates)
         asked = {**identity(run), "refits": refits, "own": [e.document() for e in stand.own]}
-        with going_on(outputs.kept(entries, asked)):
+        with going_on(kept.of(asked) if kept else outputs.kept(entries, asked)):
             result = _found(run, stand, refits, progress)
         write_json(entries / DIAGNOSIS, result.document())
     return result
@@ -379,22 +378,3 @@ def _unseen(stand: Stand, run: Run, progress: Progress) -> Errors:
     """Residuals of stops that a model was not fitted to, left out as the run left them out."""
     by, count = run.model["hold_out"], run.model["folds"]
     return held_out(stand.sources, stand.model, by, count, progress, stand.estimate.start)
-
-
-def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ()) -> Stand:
-    """Where a run stands: its model, its recordings, and the state in which its fit was left.
-
-    Args:
-        run: the run.
-        progress: as of `fit.solve`.
-        candidates: as of `diagnose`.
-
-    Raises:
-        InputError: its recordings are not what they were, or a file of effects is wrong.
-    """
-    sources, model = reopened(run), replace(model_of(run), moved=moved_since_cad(run.summary))
-    own = own_effects([source.rig for source in sources], candidates)
-    problem, converged = build(sources, model, progress=progress), run.summary["converged"]
-    state_of(run, problem)  # or it would look from elsewhere, unseen
-    estimate = resume(problem, start_of(run, sources), progress, converged)
-    return Stand(sources, model, problem, estimate, own=own)

@@ -96,7 +96,7 @@ def explain(
         for number in range(MOST_RUNGS):  # one that is not climbed any more, too
             outputs.settle(out / f"{number:02d}")
         own_effects((), candidates)  # what is wrong with a file is said before the first fit
-        climb = _Climb(recordings, out, progress, candidates)
+        climb = _Climb(recordings, out, entries, progress, candidates)
         climb.first(model or Model.of(None, (), (), recordings))
         diagnosis = climb.to_the_top()
         climb.clear_above()
@@ -135,11 +135,12 @@ class _Climb:
         self,
         recordings: list[Path],
         out: Path,
+        entries: Path,
         progress: Progress,
         candidates: str | Sequence[str] = (),
     ) -> None:
         self.recordings, self.out, self.progress = recordings, out, progress
-        self.candidates = candidates
+        self.candidates, self._entries = candidates, entries
         self.runs: list[Run] = []
         self.steps: list[dict[str, Any]] = []
         self.refused: list[str] = []
@@ -167,7 +168,7 @@ class _Climb:
         """Rung after rung; the last diagnosis. Each rung shows by itself whether the held-out error
         falls with what was found. Where it does not fall, the diagnosis is made once more with the
         fits that show it, and says what there is instead."""
-        refits, diagnosis = False, diagnose(self.run, self.tell, False, self.candidates)
+        refits, diagnosis = False, self._diagnosis(False)
         while len(self.runs) < MOST_RUNGS:
             found = {*diagnosis.worth_adding, *diagnosis.formulas}
             if self.improve(diagnosis):
@@ -176,8 +177,16 @@ class _Climb:
                 break
             else:
                 refits = True
-            diagnosis = diagnose(self.run, self.tell, refits, self.candidates)
+            diagnosis = self._diagnosis(refits)
         return diagnosis
+
+    def _diagnosis(self, refits: bool) -> Diagnosis:
+        """Of the last rung; what it finds on the way is kept until the ladder stands."""
+        return diagnose(self.run, self.tell, refits, self.candidates, kept=self._kept)
+
+    @cached_property
+    def _kept(self) -> outputs.Kept:
+        return outputs.kept(self._entries, {"recordings": self._told})
 
     def improve(self, diagnosis: Diagnosis) -> bool:
         """Leave out blunders; or else add what lowers the held-out error, and drop what that made

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.diagnosis.stand import Stand
 from calib.effects import Effect, NotTrustedError, own_effects, read
 from calib.problem import Problem, build
 from calib.problem.model import Model, Source
 from calib.problem.spread import names_of
 from calib.problem.without import leave_out
+from calib.recalibration.links import moved_since_cad
 from calib.rig import load_rig
 from calib.runs.run import DIAGNOSIS, MODEL, SOLUTION, STATE, Run, versions
 from calib.runs.stored import FIT_AGAIN
 from calib.solve.estimate import DOFS, SD, Start
+from calib.solve.fit import Progress, resume
 from chains import remote
 from chains.errors import InputError
 from sensors.recording import digest
@@ -216,3 +220,22 @@ def _reopened(recording: Mapping[str, str], run: Run) -> Source:
         _opened.clear()
     _opened[key] = source
     return source
+
+
+def stand_of(run: Run, progress: Progress, candidates: str | Sequence[str] = ()) -> Stand:
+    """Where a run stands: its model, its recordings, and the state in which its fit was left.
+
+    Args:
+        run: the run.
+        progress: as of `fit.solve`.
+        candidates: as of `diagnose`.
+
+    Raises:
+        InputError: its recordings are not what they were, or a file of effects is wrong.
+    """
+    sources, model = reopened(run), replace(model_of(run), moved=moved_since_cad(run.summary))
+    own = own_effects([source.rig for source in sources], candidates)
+    problem, converged = build(sources, model, progress=progress), run.summary["converged"]
+    state_of(run, problem)  # or it would look from elsewhere, unseen
+    estimate = resume(problem, start_of(run, sources), progress, converged)
+    return Stand(sources, model, problem, estimate, own=own)

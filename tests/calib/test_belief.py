@@ -12,7 +12,8 @@ from calib.diagnosis.search import search
 from calib.results.outstanding import outstanding, standing_out
 from calib.runs.belief import cautions, forbids, limits
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 from calib.runs.run import Run
 from calib.show.verdict import judge
 from calib.simulation import simulate

@@ -11,7 +11,8 @@ from calib.diagnosis.search import beside_formulas, search
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import find
 from calib.effects.own.formula import FormulaEffect
-from calib.runs.diagnose import stand_of, with_formulas_and_names
+from calib.runs.diagnose import with_formulas_and_names
+from calib.runs.reopen import stand_of
 from sensors.recording import read_table, write_table
 
 from ..worlds import World, write

@@ -14,7 +14,7 @@ from calib.problem.model import Model, Source
 from calib.problem.spread import Whose, readings, sigmas, spread_of, with_spread
 from calib.problem.without import leave_out
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import stand_of
+from calib.runs.reopen import stand_of
 from calib.solve.components.told import Told, ToldApart
 from chains.errors import InputError
 

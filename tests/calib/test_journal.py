@@ -13,6 +13,7 @@ from calib.outputs.journal import Journal, going_on
 from calib.outputs.parts import Kept
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
+from calib.runs.explain import explain
 from calib.runs.run import DIAGNOSIS
 from calib.simulation import Spec, simulate
 
@@ -92,6 +93,19 @@ def test_what_is_as_soon_computed_again_is_not_kept(tmp_path, monkeypatch):
     assert not files(tmp_path)
 
 
+def in_look(number: int):
+    """Progress that is interrupted half-way through a look."""
+    looks = 0
+
+    def progress(what: str, done: int, total: int) -> None:
+        nonlocal looks
+        looks += "testing what is missing" in what and done == 0
+        if looks >= number and "testing what is missing" in what and done == total // 2:
+            raise KeyboardInterrupt
+
+    return progress
+
+
 @pytest.mark.usefixtures("unhurried")
 def test_a_diagnosis_that_is_cut_short_goes_on(tmp_path, caplog):
     """To the same document, through every fit and look on its way; one that is asked anything else
@@ -101,26 +115,44 @@ def test_a_diagnosis_that_is_cut_short_goes_on(tmp_path, caplog):
     run = calibrate(tmp_path / "rec", tmp_path / "run")
     told = diagnose(run).sentences[0]
     assert told.startswith("incidence_angle_bias is missing")
-    whole, looks = (run.folder / DIAGNOSIS).read_bytes(), 0
-
-    def in_the_second_look(what: str, done: int, total: int) -> None:
-        nonlocal looks
-        looks += "testing what is missing" in what and done == 0
-        if looks > 1 and done == total // 2:
-            raise KeyboardInterrupt
-
+    whole = (run.folder / DIAGNOSIS).read_bytes()
     with pytest.raises(KeyboardInterrupt):
-        diagnose(run, in_the_second_look)
+        diagnose(run, in_look(2))
     caplog.clear()
     diagnose(run)
     assert (run.folder / DIAGNOSIS).read_bytes() == whole
     sums = next(r.args[0] for r in caplog.records if "sums of stops" in r.msg)
     assert sums > 8 and "answers of passes" in caplog.text
 
-    looks = 0
     with pytest.raises(KeyboardInterrupt):
-        diagnose(run, in_the_second_look)
+        diagnose(run, in_look(2))
     caplog.clear()
     diagnose(run, refits=False)
     assert "sums of stops" not in caplog.text
+    assert not list(tmp_path.glob(".*.rigcal"))
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("unhurried")
+def test_a_ladder_goes_on_from_the_looks_of_all_its_rungs(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "rigcal")
+    simulate(SMALL, tmp_path / "rec", 1, {"incidence_angle_bias": 1.0})
+    passes = []
+
+    def counting(what: str, done: int, total: int) -> None:
+        passes.extend([what] * ("testing what is missing" in what and done == 0))
+
+    whole = explain(tmp_path / "rec", tmp_path / "whole", progress=counting)
+    assert len(whole.runs) > 1
+    with pytest.raises(KeyboardInterrupt):
+        explain(tmp_path / "rec", tmp_path / "cut", progress=in_look(len(passes)))
+    caplog.clear()
+    again = explain(tmp_path / "rec", tmp_path / "cut")
+    sums = next(r.args[0] for r in caplog.records if "sums of stops" in r.msg)
+    assert sums > 0 and again.steps[-1]["added"] == whole.steps[-1]["added"]
+    for rung in ("00", "01"):
+        one, other = (tmp_path / name / rung / DIAGNOSIS for name in ("whole", "cut"))
+        assert one.read_text().replace("/whole/", "/cut/") == other.read_text()
+    counts = [r.args[0] for r in caplog.records if "sums of stops" in r.msg]
+    assert len(counts) == 2  # of the first rung's diagnosis, which was done, too
     assert not list(tmp_path.glob(".*.rigcal"))

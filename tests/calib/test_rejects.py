@@ -11,7 +11,8 @@ from calib.diagnosis.rejects import _p_values, _View, rejects
 from calib.diagnosis.rejects.counts import CellAxis
 from calib.diagnosis.rejects.found import Place, Rejects
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 from calib.simulation import Spec, simulate
 
 from .rescans import Change, change_ranges, sector

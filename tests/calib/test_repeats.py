@@ -9,9 +9,9 @@ from calib.diagnosis.search import MOST_NEEDED
 from calib.diagnosis.search.shapes import retuned
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate, grow, grown_model
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
 from calib.runs.explain import explain
-from calib.runs.reopen import model_of
+from calib.runs.reopen import model_of, stand_of
 
 from . import arm_worlds
 from .simulated import made

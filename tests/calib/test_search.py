@@ -17,7 +17,7 @@ from calib.effects import GEOMETRY, find
 from calib.problem.build import shapes_of
 from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import stand_of
+from calib.runs.reopen import stand_of
 from chains import se3
 
 from ..bench import arm_effects

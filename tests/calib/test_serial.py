@@ -13,7 +13,8 @@ from calib.diagnosis.chance.serial import FEWEST_IN_SERIES, drifting, p_serial
 from calib.diagnosis.search import search
 from calib.effects import find
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 
 from . import arm_worlds
 

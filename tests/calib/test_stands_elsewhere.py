@@ -15,7 +15,8 @@ from calib.diagnosis.rejects.counts import _rank as rank
 from calib.diagnosis.rejects.moved import moved
 from calib.results.check import check
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 from tests.worlds import World, write
 
 ROOM = World(seed=4, locations=4, stops=4, beams=1500)

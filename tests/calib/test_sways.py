@@ -9,7 +9,8 @@ import yaml
 
 from calib.diagnosis.search import search
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import diagnose, stand_of
+from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 from calib.simulation import Spec, simulate
 from chains import se3
 

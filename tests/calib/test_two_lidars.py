@@ -8,7 +8,7 @@ from calib.effects import find
 from calib.problem.build import shapes_of, stops_view
 from calib.problem.model import Source
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import stand_of
+from calib.runs.reopen import stand_of
 from calib.simulation import Spec, simulate
 
 from . import simulated
