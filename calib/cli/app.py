@@ -54,7 +54,7 @@ app = typer.Typer(
 # Results go there; -q takes everything else that is printed away from it.
 _stdout: TextIO | None = None
 _verbose = False
-_interrupted = False
+_pressed = False
 
 
 def _print_version(asked: bool) -> None:
@@ -192,16 +192,16 @@ def heeding_ctrl_c() -> Iterator[None]:
     """Within, Ctrl-C ends a command even if Python drops its exception, as it does where that comes
     while an object is being freed: `progress_bar` raises it again at the next step. A shell that
     wants it ignored has its way."""
-    global _interrupted
-    before, _interrupted = signal.getsignal(signal.SIGINT), False
+    global _pressed
+    before, _pressed = signal.getsignal(signal.SIGINT), False
     mine = threading.current_thread() is threading.main_thread()  # others may not ask for signals
     if before is not signal.default_int_handler or not mine:
         yield
         return
 
     def interrupt(number: int, frame: object) -> None:
-        global _interrupted
-        _interrupted = True
+        global _pressed
+        _pressed = True
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, interrupt)
@@ -217,7 +217,7 @@ def progress_bar() -> Iterator[Progress]:
     with _steps_shown() as show:
 
         def step(what: str, done: int, total: int) -> None:
-            if _interrupted:
+            if _pressed:
                 raise KeyboardInterrupt
             show(what, done, total)
 

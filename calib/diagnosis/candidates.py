@@ -99,7 +99,8 @@ def finer(effect: Effect, grid: Sequence[float]) -> list[Effect]:
     """An effect in finer shapes between those of a grid beside its own, which is one of them."""
     i = grid.index(effect.shape)
     ends = grid[max(0, i - 1)], grid[min(len(grid) - 1, i + 1)]
-    spaced = (np.geomspace if ends[0] > 0 else np.linspace)(*ends, FINER)
+    evenly = effect.jumps or ends[0] <= 0  # else in its logarithm
+    spaced = (np.linspace if evenly else np.geomspace)(*ends, FINER)
     spaced = np.rint(spaced) if effect.whole else spaced
     shapes = {float(f"{shape:.6g}") for shape in (*spaced, effect.shape)}
     return [effect.at(shape) for shape in sorted(shapes)]

@@ -25,6 +25,7 @@ from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
 UNFELT = 1e-9  # of an effect's largest column, below which no row feels a parameter
+CLUSTERS = 4096  # that are projected at once: bounds the memory
 SCORE_DRAWS = 1999  # of chance: 100 of them are beyond 5 %, where looks are counted, so to 10 %
 
 
@@ -99,15 +100,15 @@ class Scores:
         """Shares of some columns (n, q) by stop and, where any place is met from several stops, by
         place, and by both, of those that have any share of any; each adds up to the score, as rows
         that have no stop, or no place, are clusters of their own."""
-        return [part[:, columns] for part in self._ways]
+        return [part[:, columns][any_share] for part, any_share in self._ways]
 
     @cached_property
-    def _ways(self) -> list[np.ndarray]:
-        """The same of all columns, (n, Q) each."""
+    def _ways(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The same of all columns, (n, Q) each, and which of these rows (n,) have any share."""
         every = [np.vstack([self.by_stop, self.cells[self.stop < 0]])]
         if np.bincount(self.place[self.place >= 0]).max(initial=0) > 1:
             every += [np.vstack([self.by_place, self.cells[self.place < 0]]), self.cells]
-        return [part[np.any(part, axis=1)] for part in every]
+        return [(part, np.any(part, axis=1)) for part in every]
 
     @cached_property
     def sharing(self) -> int:
@@ -165,6 +166,18 @@ def _left(linear: Linear, theirs: np.ndarray, model: np.ndarray, taken: np.ndarr
     return left
 
 
+def _projected(
+    gradient: np.ndarray, theirs: np.ndarray, model: np.ndarray, taken: np.ndarray
+) -> np.ndarray:
+    """Gradients (C, Q) of clusters by variables, projected so; some clusters at once, as there may
+    be gigabytes of them."""
+    out = np.empty((len(gradient), len(theirs)))
+    for at in range(0, len(gradient), CLUSTERS):
+        some = slice(at, at + CLUSTERS)
+        np.subtract(gradient[some, theirs], gradient[some, model] @ taken, out=out[some])
+    return out
+
+
 def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
     """Project variables off the model, be they candidates or of the model itself; that has spent
     so many unknowns on stops alone."""
@@ -180,7 +193,7 @@ def project(linear: Linear, names: Sequence[str], spent: int = 0) -> Scores:
         information=_left(linear, theirs, model, taken),
         felt=np.concatenate([np.diag(linear.raw[name]) for name in names]),
         whole={name: linear.raw[name] for name in names},
-        cells=linear.gradient[:, theirs] - linear.gradient[:, model] @ taken,
+        cells=_projected(linear.gradient, theirs, model, taken),
         stop=linear.stop,
         place=linear.place,
         weight_m2=linear.weight_m2,

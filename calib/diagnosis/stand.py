@@ -43,8 +43,9 @@ from sensors.holds import spread_known
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
-# Of a scan, to find between which shapes the best is; and what they say so often by chance is not
-# looked at with all beams, as a name needs a p-value some hundred times smaller: choices.
+# Beams of a scan at most that say between which shapes of a grid those of the next one are: a
+# choice. What chance does to them so often is not looked at with all beams: a name needs a p-value
+# some hundred times smaller, and what 131,072 beams show alone is smaller than errors of a mesh.
 REFINING_BEAMS, TOO_LIKELY = 4_096, 0.05
 
 
@@ -317,10 +318,10 @@ class Look:
 
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
         """A look at one candidate alone, in finer shapes between those of the grid beside its own;
-        and the best of them, whose p-value is to be adjusted for these shapes as well. Some beams
-        say between which shapes of a finer grid those of the next one are."""
+        and the best of them, whose p-value is to be adjusted for these shapes as well. All
+        but the last grid are looked at with some beams alone."""
         stand, near, finest = self.stand, self, candidate
-        grid, times = shapes_of(candidate.effect, stand.sources), candidate.effect.refined
+        grid, times = shapes_of(candidate.effect, stand.sources), candidate.effect.refinements
         for left in reversed(range(times if candidate.effect.shape_name else 0)):
             shaped = finer(finest.effect, grid)
             grid = [each.shape for each in shaped]

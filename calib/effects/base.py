@@ -141,7 +141,7 @@ class Effect(ABC):
         jumps: True where the basis jumps with the shape, as at the time when something slipped.
         repeats: True where a rig may have it several times, each with a shape of its own: what
             slips once may slip again, and a gear may err in more than one order.
-        refined: how often finer shapes are tried between the two of a grid beside the best one.
+        refinements: how often finer shapes are tried between the two of a grid beside the best one.
         origin: the Python file and class of a user's effect; None for one of the catalogue.
         joint_kind: "revolute", "prismatic" or "mimic" of an effect that is about such joints alone.
         needs_lidar: True of an effect that is about a LiDAR, though it does not act on its beams.
@@ -172,7 +172,7 @@ class Effect(ABC):
     whole: ClassVar[bool] = False
     jumps: ClassVar[bool] = False
     repeats: ClassVar[bool] = False
-    refined: ClassVar[int] = 1
+    refinements: ClassVar[int] = 1
     joint_kind: ClassVar[str] = ""
     needs_lidar: ClassVar[bool] = False
     needs_standing: ClassVar[bool] = False

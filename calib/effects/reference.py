@@ -17,7 +17,7 @@ SEAMS = 3  # of a mesh, along each axis: a choice; seams between them are found 
 # How often finer ones are tried between two of these, and seams beside one that was found, to
 # either side and how far apart: in shares of the mesh's length. In a room of 8 m one explains half
 # as much 50 mm off, and three times leave it at most 16 mm off.
-REFINED_SEAMS = 3
+SEAM_REFINEMENTS = 3
 SEAMS_BESIDE, SEAM_STEP = 6, 0.005
 
 
@@ -85,7 +85,7 @@ class MeshSeamX(MeshShift):
     twin = ""
     shape_name, shape, jumps = "x_m", 0.0, True
     repeats = True
-    refined = REFINED_SEAMS
+    refinements = SEAM_REFINEMENTS
     axis = 0  # across which seams run
 
     def params(self, rig: Rig) -> tuple[Param, ...]:

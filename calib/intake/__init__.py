@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def import_files(
         write_columns(folder / "stops.csv", _ordered(columns))
         if share:
             _check_names(columns["stop"].tolist())
-            kept = outputs.kept(folder, _asked(inputs, options, choices))
+            kept = outputs.kept(folder, _asked(given, options, choices, share))
             names = columns["stop"].tolist()
             odd += scans.write(folder / "scans", names, share, kept, progress)
         rods, more = targets.join(gathered.spheres, gathered.tracks)
@@ -155,16 +156,24 @@ def _inputs(given: Sequence[Given], options: Options, choices: Choices) -> list[
     return [*files, *options.packages.values(), *(Path(each) for each in named if each)]
 
 
-def _asked(inputs: Sequence[Path], options: Options, choices: Choices) -> dict[str, Any]:
-    """All that scans depend on, as JSON holds it: what was asked, and files by their size and time,
-    as logs are too long to be read once more."""
-    files = [f for path in inputs for f in (sorted(path.rglob("*")) if path.is_dir() else [path])]
-    stats = [(file, file.stat()) for file in files if file.is_file()]  # no model of the catalogue
-    return {
-        "files": [[str(file.absolute()), s.st_size, s.st_mtime_ns] for file, s in stats],
-        "options": [repr(options), repr(choices)],
-        "versions": versions(),
-    }
+def _asked(
+    given: Sequence[Given], options: Options, choices: Choices, share: scans.Share
+) -> dict[str, Any]:
+    """All that scans depend on, as JSON holds it: what was asked, which turns each stop has, and
+    files by their size and time, as logs are too long to be read once more. A reader may look for
+    files beside those that are named."""
+    named = [path for _, paths in given for path in paths]
+    beside = {file for path in named for file in path.absolute().parent.glob("*")}
+    within = {file for path in named if path.is_dir() for file in path.absolute().rglob("*")}
+    files = []
+    for file in sorted(file for file in beside | within if file.is_file()):
+        with suppress(OSError):  # which nobody could read
+            files.append([str(file), file.stat().st_size, file.stat().st_mtime_ns])
+    turns = hashlib.sha256()
+    for one, stop in share:
+        turns.update(one.time_s.tobytes() + stop.tobytes())
+    asked = [repr(options), repr(choices)]
+    return {"files": files, "asked": asked, "turns": turns.hexdigest(), "versions": versions()}
 
 
 @contextmanager

@@ -101,12 +101,19 @@ def write(
         progress: called with what is being done, and how far it is.
 
     Raises:
-        InputError: no turn has any point, or as readers do while they decode.
+        InputError: no turn has any point, times of turns go back, or as readers do while they
+            decode.
     """
     folder.mkdir()
     share = sorted(share, key=lambda entry: _first(entry[1]))
     every = [k for _, stop in share for k in stop[stop >= 0].tolist()]
     order, total = [k for k, _ in itertools.groupby(every)], len(every)
+    if len(set(order)) < len(order):
+        torn = stops[max(order, key=order.count)]
+        raise InputError(
+            f"turns of stop {torn} do not follow each other, so their times go back: was a clock "
+            "set while the LiDAR was recorded?"
+        )
 
     def work(some: Sequence[int]) -> Iterator[outputs.Finished]:
         lacking = {order[i] for i in some}

@@ -141,10 +141,11 @@ def _of_stops(
     if journal is None:
         return of(range(len(scans)))
     stops = [f"{i} {scan.name}" for i, scan in enumerate(scans)]
-    return journal.each(values, stops, of, KEPT_OF_STOP)
+    asked = {**values, "beams": [len(association.part) for association in each[1]]}
+    return journal.each(asked, stops, of, OF_STOP_KINDS)
 
 
-KEPT_OF_STOP = _OfStop, StopSums, KeptSums, Weighing, State
+OF_STOP_KINDS = _OfStop, StopSums, KeptSums, Weighing, State
 
 
 def _of_stop(

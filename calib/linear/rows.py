@@ -293,8 +293,8 @@ class StopSums:
 
 
 def _beside(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Columns (N, …) beside each other, so many rows at once: a few columns of all rows are few
-    numbers in each line of memory that they touch."""
+    """Columns (N, …) beside each other, block by block, so that what is written stays in a core's
+    cache."""
     ends = np.cumsum([each.shape[1] for each in columns])
     out = np.empty((len(columns[0]), ends[-1]))
     for at in range(0, len(out), STACKED_ROWS):

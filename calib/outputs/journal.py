@@ -2,8 +2,8 @@
 
 The same input leads the same way: a computation that is begun again asks the same questions in the
 same order. Each answer, some small arrays, is kept under its number as it is found, and with a
-digest of what was asked; one that is known is read and not computed. Of an answer to which each
-stop adds much, it is kept what each has added (`Journal.each`).
+digest of what was asked; one that is known is read and not computed. Where each stop adds much to
+an answer, each stop's share is kept (`Journal.each`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import shutil
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,16 @@ from typing import Any
 import numpy as np
 
 from calib.outputs.parts import Kept
+from chains.errors import InputError
 from sensors.documents import write_atomically
 
 Answer = dict[str, np.ndarray]
 _LOG = logging.getLogger("rigcal")
 _ASKED, _OF = "asked", "of "  # names in a file: the digest, and what stands before all others
-# Of what stops add so much is written at most for each second that a pass has taken, and in a pass
-# so much of what is free on the disk: choices. The sums of a stop of 131,072 beams in a diagnosis,
-# 9 MB, take two cores 0.7 s; those of 1,024 beams, 6 MB, are as soon computed again.
-_WRITTEN_BYTES_PER_S, _SHARE_OF_DISK = 30e6, 0.1
+# At most so much of the time of a pass is spent on keeping what stops add, and it may fill so much
+# of the disk's free room: choices. The sums of a stop of 131,072 beams in a diagnosis, 9 MB, take
+# two cores 0.7 s; those of 1,024 beams, 6 MB, are as soon computed again.
+_SHARE_OF_TIME, _SHARE_OF_DISK = 0.1, 0.1
 _DIGEST_BYTES = hashlib.sha256().digest_size
 _OF_NUMPY = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
 
@@ -46,6 +47,17 @@ class Book:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.begun, self.used, self.stops_used = folder, 0, 0, 0
+        self.room = _room(folder.parent)  # bytes that what stops add may take yet
+
+
+def _room(folder: Path) -> float:
+    """Bytes that what is kept in a folder, this and all that it was asked before, may take yet."""
+    try:
+        kept = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        return _SHARE_OF_DISK * (shutil.disk_usage(there).free + kept) - kept
+    except OSError:
+        return 0.0
 
 
 _BOOK: ContextVar[Book | None] = ContextVar("book", default=None)
@@ -94,7 +106,7 @@ class Journal:
             found = compute()
         finally:
             _BOOK.reset(token)
-        with write_atomically(file) as temporary:
+        with suppress(OSError, InputError), write_atomically(file) as temporary:  # or without it
             named = {f"{_OF}{name}": x for name, x in found.items()}
             np.savez(temporary, **{_ASKED: np.array(digest)}, **named)
         return found
@@ -118,9 +130,7 @@ class Journal:
             yield from compute(range(len(stops)))
             return
         self._count += 1
-        kept = _OfStops(
-            self._book.folder / f"found-{self._number:03d}-{self._count:06d}", _digest(asked), kinds
-        )
+        kept = _Shares(self._book, f"{self._number:03d}-{self._count:06d}", _digest(asked), kinds)
         lacking = [i for i, stop in enumerate(stops) if not kept.has(stop)]
         fresh, missing = iter(compute(lacking)), set(lacking)
         for i, stop in enumerate(stops):
@@ -133,20 +143,20 @@ class Journal:
             yield found
 
 
-class _OfStops:
+class _Shares:
     """What stops add to one answer, a file of each.
 
     Args:
-        folder: of these files.
+        book: where it is kept.
+        number: of the answer.
         asked: digest of the question.
         kinds: as of `Journal.each`.
     """
 
-    def __init__(self, folder: Path, asked: str, kinds: Sequence[type]) -> None:
-        self.folder, self.asked, self.kinds = folder, asked, kinds
-        self.begun, self.last, self.written = time.monotonic(), 0, 0
-        above = next(path for path in folder.parents if path.exists())
-        self.room = _SHARE_OF_DISK * shutil.disk_usage(above).free
+    def __init__(self, book: Book, number: str, asked: str, kinds: Sequence[type]) -> None:
+        self.book, self.asked, self.kinds = book, asked, kinds
+        self.folder = book.folder / f"found-{number}-{asked[:16]}"
+        self.begun, self.spent_s, self.last = time.monotonic(), 0.0, 0
 
     def has(self, stop: str) -> bool:
         """Whether there is a file."""
@@ -163,19 +173,19 @@ class _OfStops:
 
     def write(self, stop: str, found: Any) -> None:
         """Keep what a stop adds, if there is time and room for it."""
-        allowed = min(_WRITTEN_BYTES_PER_S * (time.monotonic() - self.begun), self.room)
-        if self.written + self.last > allowed:
+        begun = time.monotonic()
+        if self.spent_s >= _SHARE_OF_TIME * (begun - self.begun) or self.last > self.book.room:
             return
         body = pickle.dumps(found, pickle.HIGHEST_PROTOCOL)
         self.last = len(body)
-        if self.written + self.last > allowed:
-            return
-        try:
-            with write_atomically(self._file(stop)) as temporary:
-                temporary.write_bytes(self._sealed(stop, body) + body)
-            self.written += self.last
-        except OSError:  # no room is left, say, and all goes on without
-            self.room = 0.0
+        if self.last <= self.book.room:
+            try:
+                with write_atomically(self._file(stop)) as temporary:
+                    temporary.write_bytes(self._sealed(stop, body) + body)
+                self.book.room -= self.last
+            except (OSError, InputError):  # the disk is full, say, and all goes on without
+                self.book.room = 0.0
+        self.spent_s += time.monotonic() - begun
 
     def _file(self, stop: str) -> Path:
         return self.folder / hashlib.sha256(stop.encode()).hexdigest()[:16]

@@ -111,7 +111,11 @@ def workshop(path: Path) -> Iterator[Workshop]:
             raise
         finally:
             if os.path.lexists(work / KEPT):
-                _LOG.warning("%s: what was done of it is kept, %s", path, TO_GO_ON)
+                size_mb = sum(p.stat().st_size for p in (work / KEPT).rglob("*")) / 1e6
+                _LOG.warning(
+                    "%s: what was done of it is kept, %s (%.0f MB in %s)",
+                    *(path, TO_GO_ON, size_mb, work.name),
+                )
             _leave(work, lock)
             for above in made:
                 with suppress(OSError):

@@ -37,7 +37,8 @@ class Suspect:
         return [fields | {"stop": stop} for stop in (*self.stops,) or (None,)]
 
 
-MOST_ALONE = 0.1  # of the stops: a choice; of rows that loggers and trackers spoil it is a few %
+# Of the stops, and in any case: choices. Loggers and trackers spoil a few % of rows.
+MOST_ALONE, FEW_ALONE = 0.1, 3
 SO_BY_CHANCE = 0.01  # a choice: how often stops each wrong by itself may follow each other so
 
 
@@ -114,16 +115,17 @@ def spells(stops: Sequence[str], time_s: np.ndarray, wrong: Collection[str]) -> 
 
 
 def rare(found: Sequence[Suspect], of: int) -> Iterator[str | Suspect]:
-    """Stops that are each wrong by themselves, among so many; or one sentence of all of them, as
-    more than a few are no mishaps: something acts on every stop, and shows at some."""
-    if len(found) <= MOST_ALONE * of:
+    """Stops at which a body is far off, each by itself, among so many; or one sentence about all of
+    them, as more than a few are no mishaps: something acts at every stop, and shows at some."""
+    if len(found) <= max(FEW_ALONE, MOST_ALONE * of):
         yield from found
         return
     worst = max(found, key=lambda one: one.size or 0.0)
     yield (
-        f"{len(found)} of {of} stops stand out, here and there, most of all so: {worst.sentence}. "
-        "So many are hardly a mishap each: does something act at all stops (a lag of the readings, "
-        "a load, a joint that slips)? rigcal fit and rigcal diagnose test for it"
+        f"at {len(found)} of {of} stops, here and there, {worst.name} is far from where other "
+        f"stops put it, by up to {1e3 * (worst.size or 0.0):.3g} mm at {worst.stops[0]}. So many "
+        "are hardly mishaps: does something act at all stops (a lag of the readings, a load, a "
+        "joint that slips)? Once it is fitted, 'rigcal diagnose' tests for that"
     )
 
 

@@ -196,8 +196,7 @@ def _spells(
 
 
 def _as_one(rig: Rig, recording: RecordedStops, pair: SeenPair, spell: Spell) -> Suspect | None:
-    """What is wrong at stops that follow each other, as what would be wrong at all were these
-    all."""
+    """What is wrong at stops that follow each other, as if these were all."""
     there = pair.some(np.isin(pair.stops, np.flatnonzero(np.isin(recording.stops, spell.stops))))
     one = _at_all_stops(there) or _misread(rig, recording, there)
     # Columns that are read otherwise are so at all of them, also where it hardly shows.
@@ -374,7 +373,9 @@ def _those_that_last(
         (worst,) = max(found, key=lambda one: one.size or 0.0).stops
         where = f"{spell}, most of all at {worst},"
         yield _at_one_stop(rig, where, at_stops[worst][1], spell.wrong, f"this {spell.course}")
-    yield from rare([*alone.values()], max(len(pair.stops) for pair in pairs.values()))
+    exchanged = any(met[0][2] for _, met in at_stops.values())
+    of = max(len(pair.stops) for pair in pairs.values())
+    yield from alone.values() if exchanged else rare([*alone.values()], of)
 
 
 def _at_one_stop(

@@ -318,7 +318,7 @@ def test_the_mesh_is_moved_beyond_a_seam_alone(source, name):
     near = np.array(find(name).at(grid[0]).beside(stops))
     assert (near < grid[0]).any() and (near > grid[0]).any() and (near > low).all()
     middle, fine = find(name).at(grid[1]), grid.tolist()
-    for _ in range(middle.refined):
+    for _ in range(middle.refinements):
         fine = [one.shape for one in finer(middle, fine)]
     assert np.diff(fine).max() < 0.01 * (high - low) and grid[1] in fine
     assert not effect.shapes(View(source.rig, 1, {}, np.zeros((1, 6))))

@@ -3,19 +3,28 @@
 import logging
 import os
 import pickle
+import shutil
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
+from calib.effects import find
+from calib.linear.clusters import Gradients
+from calib.linear.layout import Layout
+from calib.linear.linearise import linearise
 from calib.linear.rows import State
 from calib.outputs import journal
 from calib.outputs.journal import Journal, going_on
 from calib.outputs.parts import Kept
+from calib.problem.build import build
+from calib.problem.model import Model, Source
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.runs.explain import explain
 from calib.runs.run import DIAGNOSIS
 from calib.simulation import Spec, simulate
+from chains.errors import InputError
 
 STOPS = ("0 A", "1 B", "2 C")
 SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=2, column_step=100)
@@ -24,7 +33,7 @@ SMALL = Spec(lidar="hesai_pandarxt32", locations=4, stops_per_location=2, column
 @pytest.fixture
 def unhurried(monkeypatch):
     """As if each stop took long."""
-    monkeypatch.setattr(journal, "_WRITTEN_BYTES_PER_S", 1e30)
+    monkeypatch.setattr(journal, "_SHARE_OF_TIME", np.inf)
 
 
 def asked_for(folder, size: float = 1.0, kinds=(State,)) -> tuple[list, list[int]]:
@@ -84,13 +93,65 @@ def test_a_file_of_anything_but_plain_data_is_not_opened(tmp_path, unhurried, mo
 
 
 def test_what_is_as_soon_computed_again_is_not_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "_WRITTEN_BYTES_PER_S", 1e-9)
-    asked_for(tmp_path)
+    monkeypatch.setattr(journal, "_SHARE_OF_TIME", 0.0)
+    assert asked_for(tmp_path) == ([0.0, 1.0, 2.0], [0, 1, 2])
     assert not files(tmp_path)
-    monkeypatch.setattr(journal, "_WRITTEN_BYTES_PER_S", 1e30)
-    monkeypatch.setattr(journal, "_SHARE_OF_DISK", 0.0)  # nor where the disk is full
-    asked_for(tmp_path)
-    assert not files(tmp_path)
+
+
+def test_it_takes_no_more_than_its_share_of_the_disk(tmp_path, unhurried, monkeypatch):
+    """Of all that a command keeps, in this call and in those that were killed."""
+    disk = shutil.disk_usage(tmp_path)
+    asked_for(tmp_path / "one")
+    size, most = files(tmp_path)[0].stat().st_size, 0.0
+
+    def usage(path):
+        taken = sum(file.stat().st_size for file in files(tmp_path / "kept"))
+        return disk._replace(free=20 * size * 2 - taken)
+
+    monkeypatch.setattr(journal.shutil, "disk_usage", usage)
+    for number in range(1, 5):
+        asked_for(tmp_path / "kept" / str(number), number)
+        most = max(most, sum(file.stat().st_size for file in files(tmp_path / "kept")))
+    assert 3 * size < most <= 4.01 * size
+    assert asked_for(tmp_path / "kept" / "9", 9.0) == ([0.0, 9.0, 18.0], [0, 1, 2])
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left"), InputError("no folder")])
+def test_on_a_full_disk_all_goes_on_without(tmp_path, unhurried, monkeypatch, error):
+    @contextmanager
+    def full(path):
+        raise error
+        yield
+
+    monkeypatch.setattr(journal, "write_atomically", full)
+    assert asked_for(tmp_path) == ([0.0, 1.0, 2.0], [0, 1, 2])
+    with going_on(Kept(tmp_path)):
+        assert Journal().answer({"x": 1.0}, lambda: {"found": np.ones(2)})["found"].sum() == 2.0
+
+
+@pytest.mark.parametrize("mesh", [True, False])
+def test_sums_that_were_kept_are_the_sums(tmp_path, unhurried, mesh):
+    """Of two recordings whose stops have the same names, with scatter within holds; of a mesh, and
+    of planes."""
+    spec = Spec(**{**SMALL.model_dump(), "locations": 1, "column_step": 10, "mesh": mesh})
+    for name in ("one", "two"):
+        simulate(spec, tmp_path / name, 1 + len(name), {})
+    sources = [Source.open(tmp_path / name) for name in ("one", "two")]
+    model = Model.of(None, (), (), [tmp_path / "one"]).plus((find("noise_range"),))
+    problem = build(sources, model)
+    met = [scan.settled(None, problem.initial) for scan in problem.scans]
+
+    def linear():
+        with going_on(Kept(tmp_path / "kept")):
+            layout = Layout.of(problem)
+            gradients = Gradients(layout.size)
+            given = {"layout": layout, "gradients": gradients, "journal": Journal()}
+            return linearise(problem, problem.initial, met, **given), gradients.table()[0]
+
+    first, again = linear(), linear()
+    assert len(files(tmp_path / "kept")) == len(problem.scans) == 4
+    np.testing.assert_array_equal(again[0].kept, first[0].kept)
+    assert (again[1] != first[1]).nnz == 0 and again[0].beams_cost == first[0].beams_cost
 
 
 def in_look(number: int):

@@ -8,13 +8,13 @@ import yaml
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from calib.cli import main
-from calib.intake import Choices, import_files, sources
+from calib.intake import Choices, _asked, import_files, sources
 from calib.problem.model import Source
 from calib.rig import load_rig
 from calib.runs.calibrate import calibrate
 from chains.errors import InputError
 from sensors.readers import READERS
-from sensors.readers.base import Options
+from sensors.readers.base import Options, Sweeps
 
 from .. import two_arms
 from .moving import (
@@ -329,3 +329,22 @@ def test_a_name_in_rig_yaml_is_read_back_as_it_was(name, tmp_path):
 
     (tmp_path / "x.yaml").write_text(f"{_word(name)}: {{a: {_word(name)}}}\n", encoding="utf-8")
     assert read_yaml(tmp_path / "x.yaml")[0] == {name: {"a": name}}
+
+
+def test_what_is_kept_of_an_import_is_of_these_files_and_turns(files, tmp_path):
+    """The file beside a capture, of which no word is said, tells how its packets are decoded."""
+    log = tmp_path / "a.pcap"
+    log.write_bytes(b"packets")
+    beside = tmp_path / "a.json"
+    beside.write_text("{}")
+    sweeps = Sweeps("a", "a", np.arange(3.0), lambda wanted: iter(()))
+
+    def asked(stops=(0, 0, 1), **options):
+        share = [(sweeps, np.array(stops))]
+        return _asked([("ouster", [log])], Options(**options), Choices(), share)
+
+    first = asked()
+    assert asked() == first
+    assert asked(stops=(0, 1, 1)) != first and asked(first_ring=1) != first
+    beside.write_text("{ }")
+    assert asked() != first

@@ -92,6 +92,13 @@ def test_scans_of_an_import_that_was_killed_are_not_read_again(tmp_path):
             np.testing.assert_array_equal(found[stop][name], values)
 
 
+def test_times_that_go_back_are_refused(tmp_path):
+    """A stop's turns would be two scans of one name."""
+    share, _ = scans.by_time([turns([0.5, 2.5, 0.9])], SPANS)
+    with pytest.raises(InputError, match=r"turns of stop a do not .* go back"):
+        write(tmp_path / "scans", share)
+
+
 def test_two_lidars_at_once_are_refused():
     with pytest.raises(InputError, match="--topic"):
         scans.by_time([turns([0, 2]), turns([1, 3], "rear")], SPANS)
