@@ -275,8 +275,7 @@ def _misread(rig: Rig, recording: RecordedStops, pair: SeenPair) -> Suspect | No
     off = far_off(pair, roots_of(pair))
     if len(pair.stops) < 4 or len(off) < FEWEST_OFF:
         return None
-    names, left = " and ".join(pair.names), {}
-    read = recording.joints[pair.stops]
+    names, left, read = " and ".join(pair.names), {}, recording.joints[pair.stops]
     for what, otherwise in _otherwise_read(rig, pair.joints_between(rig), read):
         moved = pair.reading(rig, otherwise)
         left[what] = len(far_off(moved, roots_of(moved)))
@@ -373,9 +372,9 @@ def _those_that_last(
         (worst,) = max(found, key=lambda one: one.size or 0.0).stops
         where = f"{spell}, most of all at {worst},"
         yield _at_one_stop(rig, where, at_stops[worst][1], spell.wrong, f"this {spell.course}")
-    exchanged = any(met[0][2] for _, met in at_stops.values())
     of = max(len(pair.stops) for pair in pairs.values())
-    yield from alone.values() if exchanged else rare([*alone.values()], of)
+    swaps = any(met[0][2] for _, met in at_stops.values())
+    yield from alone.values() if swaps else rare([*alone.values()], of)
 
 
 def _at_one_stop(
