@@ -38,7 +38,7 @@ class Suspect:
 
 
 # Of the stops, and in any case: choices. Loggers and trackers spoil a few % of rows.
-MOST_ALONE, FEW_ALONE = 0.1, 3
+MOST_ALONE, FEW_ALONE = 0.1, 5
 SO_BY_CHANCE = 0.01  # a choice: how often stops each wrong by itself may follow each other so
 
 

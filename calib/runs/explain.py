@@ -186,7 +186,7 @@ class _Climb:
 
     @cached_property
     def _kept(self) -> outputs.Kept:
-        return outputs.kept(self._entries, {"recordings": self._told})
+        return outputs.kept(self._entries, {"recordings": list(map(str, self.recordings))})
 
     def improve(self, diagnosis: Diagnosis) -> bool:
         """Leave out blunders; or else add what lowers the held-out error, and drop what that made

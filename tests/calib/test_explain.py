@@ -44,7 +44,7 @@ class World:
         summary = {"rms_mm": rms, "converged": True, "held_out_each_mm": self.each.get(names)}
         return Run(out, model.document() | {"grown_from": grown_from}, summary, None)
 
-    def diagnose(self, run, progress, refits, candidates=()):
+    def diagnose(self, run, progress, refits, candidates=(), kept=None):
         self.refits.append(refits)
         names = frozenset(run.effects) - frozenset(Model().names)
         adding = self.named.get(names, [])
