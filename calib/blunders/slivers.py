@@ -1,0 +1,60 @@
+"""Narrow parts of a mesh most of whose beams a fit rejects: the few left do not say where it is.
+
+Beams that pass the edge of a narrow part by a millimetre meet it by what the mesh says, and
+something else in the room. Where these are more than half, the others are no sample of the part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from functools import partial
+
+import numpy as np
+
+from calib.effects.basis import place_of
+from calib.linear.parallel import over_stops
+from calib.residuals.beams import Association
+from calib.residuals.groups import Group, kind_and_number
+from calib.residuals.scan import ScanStop
+from calib.solve.estimate import Estimate
+
+KEPT_BEAMS = 0.5  # of those that meet a part: with fewer, their median is of something else
+# Beams of a scan that meet a part, on average of those that do: with fewer, none has others on both
+# sides, and all may be at its edges.
+INSIDE_BEAMS = 3.0
+Numbers = Mapping[str, np.ndarray]
+"""Kind of part -> the numbers (n,) of some parts, ascending."""
+
+
+def slivers(estimate: Estimate, parts: Collection[Group]) -> set[Group]:
+    """Those of some parts of the mesh that are narrow, and of whose beams a fit rejects most."""
+    if not parts:
+        return set()
+    groups = {kind_and_number(group.what): group for group in parts}
+    kinds = {kind for kind, _ in groups}
+    numbers = {kind: np.array(sorted(n for k, n in groups if k == kind)) for kind in kinds}
+    work = partial(_counted, estimate.values, numbers)
+    counts = {kind: np.zeros((3, len(some)), int) for kind, some in numbers.items()}
+    for found in over_stops(work, estimate.scans, estimate.associations):
+        for kind, count in found.items():
+            counts[kind] += count
+    return {
+        groups[kind, number]
+        for kind, some in numbers.items()
+        for number, (scans, met, kept) in zip(some.tolist(), counts[kind].T.tolist(), strict=True)
+        if kept < KEPT_BEAMS * met and met < INSIDE_BEAMS * scans
+    }
+
+
+def _counted(
+    values: Mapping[str, np.ndarray], numbers: Numbers, scan: ScanStop, association: Association
+) -> dict[str, np.ndarray]:
+    """Of each part (3, n), whether any beam of a scan meets it, how many do, and how many of these
+    have any weight."""
+    rows, counts = scan.rows(values, association), {}
+    for kind, some in numbers.items():
+        at = place_of(scan.parts(association, kind), some)
+        beams = (at[which & (at >= 0)] for which in (rows.usable, rows.weight > 0))
+        met, kept = (np.bincount(each, minlength=len(some)) for each in beams)
+        counts[kind] = np.stack([met > 0, met, kept])
+    return counts

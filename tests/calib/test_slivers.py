@@ -1,0 +1,64 @@
+"""A narrow part of the mesh that most beams pass is not said to be off by what few of them say."""
+
+import shutil
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from calib.blunders.slivers import slivers
+from calib.problem.build import build
+from calib.problem.model import Model, Source
+from calib.residuals.groups import MESH, Group
+from calib.simulation import Spec
+from calib.solve.fit import solve
+from sensors.recording import read_table, write_table
+
+from .simulated import made
+
+SPEC = Spec(lidar="hesai_pandarxt32", locations=3, stops_per_location=2, column_step=40)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A recording, and of its patches (stop, ring, column) of the beams that meet them."""
+    folder = tmp_path_factory.mktemp("slivers") / "rec"
+    estimate = solve(build([made(folder, SPEC)[0]], Model()))
+    beams: dict[int, list[tuple[str, int, int]]] = {}
+    for scan, association in zip(estimate.scans, estimate.associations, strict=True):
+        read, _ = scan.store.read(scan.index)
+        for k, part in enumerate(scan.parts(association, "patch").tolist()):
+            beams.setdefault(part, []).append((scan.name, int(read.ring[k]), int(read.column[k])))
+    return folder, {part: some for part, some in beams.items() if part >= 0}
+
+
+def a_scan(beams) -> float:
+    return float(np.mean([*Counter(stop for stop, *_ in beams).values()]))
+
+
+@pytest.mark.parametrize(
+    ("narrow", "share", "is_sliver"),
+    [(True, 0.0, False), (True, 0.3, False), (True, 0.8, True), (False, 0.8, False)],
+)
+def test_narrow_parts_of_which_most_beams_are_rejected(fitted, tmp_path, narrow, share, is_sliver):
+    """They meet what stands 60 mm before it."""
+    folder, patches = fitted
+    shutil.copytree(folder, tmp_path / "rec")
+    size = (5, 14) if narrow else (25, 60)
+    part, beams = next(
+        (part, some)
+        for part, some in patches.items()
+        if size[0] < len(some) < size[1] and (a_scan(some) < 2.5) == narrow
+    )
+    passing = set(beams[: int(share * len(beams))])
+    for path in sorted((tmp_path / "rec" / "scans").glob("*.parquet")):
+        table = read_table(path)
+        every = zip(table["ring"].tolist(), table["column"].tolist(), strict=True)
+        near = np.array([(path.stem, *beam) in passing for beam in every])
+        points = np.stack([table[axis] for axis in "xyz"], axis=1).astype(float)
+        points[near] *= 1.0 - 0.06 / np.linalg.norm(points[near], axis=1, keepdims=True)
+        write_table(path, table | dict(zip("xyz", points.astype(np.float32).T, strict=True)))
+    estimate = solve(build([Source.open(tmp_path / "rec")], Model()))
+    group = Group("surface", MESH, f"patch_{part}")
+    assert slivers(estimate, [group]) == ({group} if is_sliver else set())
+    assert slivers(estimate, []) == set()
