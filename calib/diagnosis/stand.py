@@ -44,9 +44,9 @@ from sensors.holds import spread_known
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
-# Beams of a scan at most that say between which shapes of a grid those of the next one are: a
-# choice. What chance does to them so often is not looked at with all beams: a name needs a p-value
-# some hundred times smaller, and what 131,072 beams show alone is smaller than errors of a mesh.
+# Beams of a scan at most that say between which shapes of a grid those of the next one are, and the
+# p-value with them above which all beams are not asked: choices. A name needs a p-value some
+# hundred times smaller, and what only 131,072 beams show is smaller than errors of a mesh.
 REFINING_BEAMS, TOO_LIKELY = 4_096, 0.05
 
 
@@ -323,8 +323,8 @@ class Look:
 
     def closely(self, candidate: Candidate, progress: Progress) -> tuple[Look, Candidate]:
         """A look at one candidate alone, in finer shapes between those of the grid beside its own;
-        and the best of them, whose p-value is to be adjusted for these shapes as well. All
-        but the last grid are looked at with some beams alone."""
+        and the best of them, whose p-value is to be adjusted for these shapes as well. All but the
+        last grid are looked at with some of the beams."""
         stand, near, finest = self.stand, self, candidate
         grid, times = shapes_of(candidate.effect, stand.sources), candidate.effect.refinements
         for left in reversed(range(times if candidate.effect.shape_name else 0)):

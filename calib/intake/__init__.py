@@ -160,13 +160,14 @@ def _asked(
     given: Sequence[Given], options: Options, choices: Choices, share: scans.Share
 ) -> dict[str, Any]:
     """All that scans depend on, as JSON holds it: what was asked, which turns each stop has, and
-    files by their size and time, as logs are too long to be read once more. A reader may look for
-    files beside those that are named."""
-    named = [path for _, paths in given for path in paths]
-    beside = {file for path in named for file in path.absolute().parent.glob("*")}
-    within = {file for path in named if path.is_dir() for file in path.absolute().rglob("*")}
+    files by their size and time, as logs are too long to be read once more. Beside a capture its
+    reader looks for the sensor's JSON."""
+    named = [path.absolute() for _, paths in given for path in paths]
+    beside = {file for path in named for file in path.parent.glob("*.json")}
+    within = {file for path in named if path.is_dir() for file in path.rglob("*")}
+    every = beside | within | {path.absolute() for path in _inputs(given, options, choices)}
     files = []
-    for file in sorted(file for file in beside | within if file.is_file()):
+    for file in sorted(file for file in every if file.is_file()):
         with suppress(OSError):  # which nobody could read
             files.append([str(file), file.stat().st_size, file.stat().st_mtime_ns])
     turns = hashlib.sha256()

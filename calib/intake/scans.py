@@ -142,8 +142,7 @@ def write(
 
 
 def _in_turn(share: Share, some: Collection[int]) -> Iterator[tuple[int, Sweep]]:
-    """Turns of some stops, and their stops, stop by stop as long as each source is in order of
-    time."""
+    """Turns of some stops, each with its stop, source after source."""
     for one, stop in share:
         wanted = np.isin(stop, list(some))
         if wanted.any():

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from calib.outputs.parts import Kept
+from calib.outputs.workshop import bytes_in
 from chains.errors import InputError
 from sensors.documents import write_atomically
 
@@ -52,9 +53,9 @@ class Book:
 
 def _room(folder: Path) -> float:
     """Bytes that what is kept in a folder, this and all that it was asked before, may take yet."""
+    kept = bytes_in(folder)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
     try:
-        kept = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-        there = next(path for path in (folder, *folder.parents) if path.exists())
         return _SHARE_OF_DISK * (shutil.disk_usage(there).free + kept) - kept
     except OSError:
         return 0.0

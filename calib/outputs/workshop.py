@@ -111,11 +111,8 @@ def workshop(path: Path) -> Iterator[Workshop]:
             raise
         finally:
             if os.path.lexists(work / KEPT):
-                size_mb = sum(p.stat().st_size for p in (work / KEPT).rglob("*")) / 1e6
-                _LOG.warning(
-                    "%s: what was done of it is kept, %s (%.0f MB in %s)",
-                    *(path, TO_GO_ON, size_mb, work.name),
-                )
+                said = "%s: what was done of it is kept, %s (%.0f MB in %s)"
+                _LOG.warning(said, path, TO_GO_ON, bytes_in(work / KEPT) / 1e6, work.name)
             _leave(work, lock)
             for above in made:
                 with suppress(OSError):
@@ -198,6 +195,15 @@ def _leave(work: Path, lock: int) -> None:
             os.rmdir(work)
     finally:
         os.close(lock)
+
+
+def bytes_in(folder: Path) -> int:
+    """How much the files in a folder take; those that vanish meanwhile take nothing."""
+    total = 0
+    for path in folder.rglob("*"):
+        with suppress(OSError):
+            total += path.lstat().st_size if path.is_file() else 0
+    return total
 
 
 def _remove(path: Path) -> None:

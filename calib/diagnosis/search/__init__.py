@@ -364,9 +364,8 @@ def _fitted(
     confirmed what it explains, at that of the other (`sure`)."""
     near, finest = look.closely(candidate, progress)
     test, p = judged(near, finest, progress)
-    if (
-        p >= ALPHA_EFFECT and finest.effect.jumps and finest is not candidate
-    ):  # few rows tell of its exact place
+    # Few rows tell of the exact place of what jumps.
+    if p >= ALPHA_EFFECT and finest.effect.jumps and finest is not candidate:
         p = min(p, 2.0 * judged(look, candidate, progress)[1])
     p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
     if p >= ALPHA_EFFECT:

@@ -346,5 +346,7 @@ def test_what_is_kept_of_an_import_is_of_these_files_and_turns(files, tmp_path):
     first = asked()
     assert asked() == first
     assert asked(stops=(0, 1, 1)) != first and asked(first_ring=1) != first
+    (tmp_path / "import.log").write_text("what the command prints, in the same folder")
+    assert asked() == first
     beside.write_text("{ }")
     assert asked() != first
