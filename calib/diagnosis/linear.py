@@ -35,7 +35,11 @@ from calib.solve.reweight import weighted_as
 # Priors of the hardware (CAD, data sheets) are no evidence against a candidate. Their sigmas are
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
-# All beams judge a candidate if their rows take no more numbers than this (268 MB), one for each
+# Beams of all scans together that tell what is missing, and of each scan at any rate; all, if they
+# are no more. Both are choices: what so many beams of 2 mm do not show of 128 parameters is below
+# 0.03 mm, and errors of stops and of the mesh are larger.
+LOOKED_BEAMS, FEWEST_LOOKED = 2**20, 4096
+# All of these judge a candidate if their rows take no more numbers than this (268 MB), one for each
 # direction: of each stop and surface no more rows are kept than there are directions.
 JUDGING_NUMBERS = 2**25
 # Else beams are drawn whose rows take so many numbers, and at least so many of each stop; both are
@@ -105,6 +109,11 @@ class Linear:
         )
 
 
+def beams_looked_at(problem: Problem) -> int:
+    """About how many beams of each scan, at most, tell what is missing."""
+    return max(LOOKED_BEAMS // max(len(problem.scans), 1), FEWEST_LOOKED)
+
+
 def rows_along(
     linear: Linear,
     wide: Problem,
@@ -112,8 +121,8 @@ def rows_along(
     away: np.ndarray,
     progress: Callable[[int, int], None],
 ) -> Iterator[ClusteredRows]:
-    """Weighted rows along some directions: all that are of no beam, and of all beams or, where
-    these are too many, of some that are drawn (see `JUDGING_NUMBERS`).
+    """Weighted rows along some directions: all that are of no beam, and of `beams_looked_at` or,
+    where these are too many, of fewer beams (see `JUDGING_NUMBERS`).
 
     Args:
         linear: that knows these directions, and the rows that are of no beam.
@@ -138,10 +147,10 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    most, cells = None, np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
-    count = away.shape[1]
+    most, count = beams_looked_at(wide), away.shape[1]
+    cells = np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
     if cells * count**2 > JUDGING_NUMBERS:
-        most = max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN)
+        most = min(most, max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN))
     yield from beams.rows(most)
 
 
@@ -160,7 +169,7 @@ def linearise_with(
     estimate: Estimate,
     candidates: Sequence[str],
     progress: Progress,
-    most: int | None = None,
+    most: int,
 ) -> Linear:
     """Linearise a problem that holds candidates beside the model, at the model's solution.
 
@@ -169,7 +178,7 @@ def linearise_with(
         estimate: the model's solution.
         candidates: unknowns that the model does not have; they have no prior here.
         progress: called with what is being done, how many stops are done, and of how many.
-        most: about how many beams of each scan, at most, for a first answer; all where None.
+        most: about how many beams of each scan at most.
     """
     wide, values = beside(wide, estimate)
     wide, associations = _drawn(wide, estimate.associations, most)
@@ -215,12 +224,10 @@ def linearise_with(
 
 
 def _drawn(
-    problem: Problem, associations: Sequence[Association], most: int | None
+    problem: Problem, associations: Sequence[Association], most: int
 ) -> tuple[Problem, Sequence[Association]]:
     """A problem with about so many beams of each scan, drawn from those on each surface, and what
-    they meet; all where None."""
-    if most is None:
-        return problem, associations
+    they meet; all of no more."""
     met = zip(problem.scans, associations, strict=True)
     some = [scan.some(association, most) for scan, association in met]
     return replace(problem, scans=[s for s, _, _ in some]), [a for _, a, _ in some]

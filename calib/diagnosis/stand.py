@@ -20,7 +20,7 @@ from calib.diagnosis.chance.agreeing import agreements
 from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_serial
 from calib.diagnosis.judges import Shares
-from calib.diagnosis.linear import Linear, linearise_with, rows_along
+from calib.diagnosis.linear import Linear, beams_looked_at, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.diagnosis.structure import covariates, of_look, singly, structure
@@ -173,12 +173,13 @@ class Stand:
     def linearise(
         self, candidates: Sequence[Effect], progress: Progress, most: int | None = None
     ) -> tuple[Linear, dict[str, np.ndarray], dict[str, list[np.ndarray]]]:
-        """All rows with these candidates beside the model, or about so many of each scan at most;
-        each one's columns among theirs; and the same apart for each of its unknowns, of which every
-        rig may have one."""
+        """All rows with these candidates beside the model, of beams about `most` of each scan or
+        `beams_looked_at`; each one's columns among theirs; and the same apart for each of its
+        unknowns, of which every rig may have one."""
         wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = variables_of(wide, {e.name for e in candidates})
         every = [*chain(*variables.values())]
+        most = most or beams_looked_at(wide)
         linear = linearise_with(wide, self.estimate, every, progress, most)
         at, start = {}, 0
         for name, theirs in variables.items():

@@ -30,7 +30,6 @@ def linearise(
     problem: Problem,
     values: Values,
     associations: Sequence[Association | None],
-    newton: bool = False,
     layout: Layout | None = None,
     gradients: Gradients | None = None,
     beams: bool = True,
@@ -46,7 +45,6 @@ def linearise(
         problem: what is estimated; surfaces' unknowns included where it has any.
         values: the state.
         associations: per scan, what its beams meet; found anew where None.
-        newton: whether curvature takes the place of weight; see `Rows.whitened`.
         layout: of the problem, if there is one already.
         gradients: takes those of the clusters of beams, where they are wanted.
         beams: False for tracked bodies alone.
@@ -64,7 +62,7 @@ def linearise(
     assembly = Assembly(layout, own, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
-    work = partial(_of_stop, layout, State(values), newton, gradients is not None)
+    work = partial(_of_stop, layout, State(values), gradients is not None)
     each = placed, associations, slowed or [None] * count, weighed or [None] * count
     found: list[_OfStop] = []
     for i, stop in enumerate(_of_stops(work, scans, each, values, journal)):
@@ -151,7 +149,6 @@ OF_STOP_KINDS = _OfStop, StopSums, KeptSums, Weighing, State
 def _of_stop(
     layout: Layout,
     state: State,
-    newton: bool,
     clustered: bool,
     scan: ScanStop,
     placed: Placed,
@@ -160,7 +157,7 @@ def _of_stop(
     weighed: Weighing | None,
 ) -> _OfStop:
     """Of the scan of one stop, whose LiDAR is `placed`; other arguments as of `linearise`."""
-    rows = StopRows.of(scan, layout, state.values, placed, association, newton, slowed)
+    rows = StopRows.of(scan, layout, state.values, placed, association, slowed)
     here, scatter = Weighing.of(rows.rows, state, placed.T[0]), None
     at = partial(_rows_at, scan, association)
     if rows.rows.spread is not None:

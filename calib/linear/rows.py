@@ -120,7 +120,6 @@ class StopRows:
         values: Mapping[str, np.ndarray],
         placed: Placed,
         association: Association | None,
-        newton: bool = False,
         slowed: Weighing | None = None,
         times: np.ndarray | None = None,
     ) -> StopRows:
@@ -132,7 +131,7 @@ class StopRows:
             rows = rows.scaled(scale)
         if times is not None:
             rows = rows.heavier(times)
-        weight, residual = rows.whitened(newton)
+        weight, residual = rows.weight_m2, rows.residual_m
         columns = [layout.columns(list(rows.dense))]
         index = np.empty((len(weight), len(rows.sparse)), np.int32)
         value = np.empty(index.shape)

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.effects import LazyColumn, OneHot, View
-from calib.residuals.robust import tukey_cost, tukey_curvature, tukey_weight
+from calib.residuals.robust import tukey_cost, tukey_weight
 from calib.residuals.spread import SpreadRows
 from sensors.lidar import Beams
 from sensors.recording import Scan
@@ -168,18 +168,10 @@ class Rows:
         spread = None if self.spread is None else self.spread.heavier(times)
         return replace(self, weight=self.weight * times, spread=spread)
 
-    def whitened(self, newton: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Weight over variance (N,) 1/m2, and the residual (N,) m that goes with it.
-
-        With `newton` the cost's curvature takes the place of the weight, and residuals are scaled
-        so that the gradient stays: fewer steps to the optimum, but not its covariance.
-        """
-        weight, residual = self.weight, self.residual_m
-        if newton:
-            z = residual / self.sigma_m
-            weight = np.where(self.usable, tukey_curvature(z, self.scale), 0.0)
-            residual = residual * (self.weight / np.maximum(weight, 1e-300))
-        return weight / np.square(self.sigma_m), residual
+    @property
+    def weight_m2(self) -> np.ndarray:
+        """Weight over variance (N,), 1/m2."""
+        return self.weight / np.square(self.sigma_m)
 
 
 def beam_derivative(beams: Beams, t: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Robust weights: Tukey's biweight, its cost and curvature, and how wide the bulk of rows is."""
+"""Robust weights: Tukey's biweight, its cost, and how wide the bulk of rows is."""
 
 from __future__ import annotations
 
@@ -22,14 +22,6 @@ def tukey_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
     """
     u = np.square(z / (TUKEY * scale))
     return np.square(np.maximum(1.0 - u, 0.0))
-
-
-def tukey_curvature(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Second derivative of the biweight's cost, ``(1 - u)(1 - 5u)`` with ``u = (z / c)^2``, held
-    above a tenth of the weight: with it in place of the weight, steps are nearly Newton's."""
-    u = np.square(z / (TUKEY * scale))
-    left = np.maximum(1.0 - u, 0.0)
-    return left * np.maximum(1.0 - 5.0 * u, 0.1 * left)
 
 
 def tukey_cost(z: np.ndarray, scale: float = 1.0) -> float:

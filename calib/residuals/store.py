@@ -18,19 +18,26 @@ from sensors.lidar import Beams, beams
 from sensors.recording import RecordedStops, Scan
 
 LEAST_KEPT_BYTES = 256e6
-KEPT_SHARE = 0.25  # of the memory, where each core has a process of its own: a choice
+KEPT_SHARE = 0.25  # of the memory: a choice
 
 
-def _kept_bytes() -> float:
-    """Of scans and beams of all recordings together; what is beyond is read again each time."""
+def _kept_bytes(processes: int) -> float:
+    """Of scans and beams of all recordings together, in each of so many processes of a machine;
+    what is beyond is read again each time."""
     memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     with suppress(OSError, ValueError):  # there is no such file, or it says "max"
         memory = min(memory, float(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    return max(LEAST_KEPT_BYTES, KEPT_SHARE * memory / (os.cpu_count() or 1))
+    return max(LEAST_KEPT_BYTES, KEPT_SHARE * memory / processes)
 
 
-KEPT_BYTES = _kept_bytes()
+KEPT_BYTES = _kept_bytes(1)
 _STORES: WeakSet[BeamStore] = WeakSet()  # that share it
+
+
+def share_memory() -> None:
+    """Keep as much as leaves room for a process on each core of the machine."""
+    global KEPT_BYTES
+    KEPT_BYTES = _kept_bytes(os.cpu_count() or 1)
 
 
 @dataclass(eq=False)
@@ -42,11 +49,13 @@ class BeamStore:
         recording: whose.
         beam_origin_m: (2,) of its LiDAR, radial and tangential.
         most: how many beams of each scan there are at most; all where None.
+        whole: the store that these few are taken from, if there is one; all of them are kept.
     """
 
     recording: RecordedStops
     beam_origin_m: tuple[float, float]
     most: int | None = None
+    whole: BeamStore | None = None
     _kept: dict[int, tuple[Scan, Beams]] = field(default_factory=dict, repr=False)
     _bytes: float = 0.0
     _lock: Lock = field(default_factory=Lock, repr=False)
@@ -67,7 +76,7 @@ class BeamStore:
         size = _size(found)
         with self._lock:
             full = sum(store._bytes for store in list(_STORES)) + size > KEPT_BYTES
-            if stop not in self._kept and not full:
+            if stop not in self._kept and (self.whole is not None or not full):
                 self._kept[stop] = found
                 self._bytes += size
         return found
@@ -76,8 +85,12 @@ class BeamStore:
         """A scan, to look at once: it takes no place of those that are asked for in each pass."""
         if stop in self._kept:
             return self._kept[stop][0]
-        scan = self.recording.scan(stop)
+        scan = self.recording.scan(stop) if self.whole is None else self.whole.read(stop)[0]
         return scan if self.most is None else _thinned(scan, self.most, stop)
+
+    def thinned(self, most: int) -> BeamStore:
+        """The same with so many beams of each scan at most."""
+        return BeamStore(self.recording, self.beam_origin_m, most, whole=self)
 
     @cached_property
     def median_intensity(self) -> float:
@@ -92,7 +105,7 @@ class BeamStore:
 
     def __getstate__(self) -> dict[str, object]:
         """Without what was read: another process reads for itself."""
-        return {n: getattr(self, n) for n in ("recording", "beam_origin_m", "most")}
+        return {n: getattr(self, n) for n in ("recording", "beam_origin_m", "most", "whole")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)

@@ -14,6 +14,7 @@ from calib import outputs
 from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
+from calib.diagnosis.linear import beams_looked_at
 from calib.diagnosis.rejects import Rejects, rejects
 from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
@@ -130,6 +131,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
             *hardly_checked(unseen),
             *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),
+            *_beams_drawn(stand),
             *run.omissions,
         ],
         command=_command(run, result),
@@ -252,6 +254,16 @@ def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
     if not noisier or max(stand.beams.alone, 0.0 if explained else stand.beams.times) <= TOLERATED:
         return []
     return [stand.beams.sentence]
+
+
+def _beams_drawn(stand: Stand) -> list[str]:
+    """How many of the beams what is missing was looked for in, if not in all."""
+    met = np.array([np.count_nonzero(met.part >= 0) for met in stand.estimate.associations])
+    used = np.minimum(met, beams_looked_at(stand.problem)).sum()
+    if used == met.sum():
+        return []
+    share = f"{used / 1e6:.1f} of {met.sum() / 1e6:.1f} million beams"
+    return [f"What is missing was looked for in {share}, drawn evenly from every scan."]
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

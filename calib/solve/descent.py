@@ -194,7 +194,6 @@ class Descent:
         least: float,
         size: float = np.inf,
         beams: bool = True,
-        hasten: bool = True,
         passes: int | None = None,
     ) -> bool:
         """Gauss-Newton passes while beams meet what they met; whether they came to their end.
@@ -205,11 +204,9 @@ class Descent:
             least: by how much the step of the last pass may lower half the chi-square.
             size: how large it may be, m and rad.
             beams: False for trackers and targets alone.
-            hasten: whether the curvature of the beams' cost may take the place of their weights.
             passes: how many at most; `MAX_PASSES` where None, and never more.
         """
-        newton, last, misled, wait, part = False, np.inf, 0, 0, 1.0
-        before, tangent, cost, fall = None, None, np.inf, 0.0
+        before, tangent, cost, fall, part = None, None, np.inf, 0.0, 1.0
         swings = False
         weighed: Sequence[Weighing] = ()
         for count in range(min(passes or MAX_PASSES, MAX_PASSES)):
@@ -217,7 +214,7 @@ class Descent:
                 self.linearise_here(beams)
             else:
                 slowed = self.here.weighed if count >= SLOWED or swings else ()
-                self.linearise(newton=newton, beams=beams, weighed=weighed, slowed=slowed)
+                self.linearise(beams=beams, weighed=weighed, slowed=slowed)
             self.passes += 1
             if before is not None:
                 fell = cost - self.here.cost_before
@@ -239,12 +236,6 @@ class Descent:
             self.values = self.moved(before, tangent, part)
             if length < size and fall < max(least, COST_ROUNDING * cost):
                 return True
-            # Where a row's curvature misleads, steps grow; its weight never does. It is tried again
-            # after twice as many passes each time, lest the steps go round in circles.
-            if newton and length >= last:
-                misled, wait = misled + 1, 2 ** (misled + 1)
-            wait = max(wait - 1, 0)
-            newton, last = hasten and beams and not wait and length < last, length
         return False
 
     def keep_scales(self) -> None:
@@ -296,17 +287,16 @@ class Descent:
     def linearise(
         self,
         associate: bool = False,
-        newton: bool = False,
         beams: bool = True,
         weighed: Sequence[Weighing] = (),
         slowed: Sequence[Weighing] = (),
     ) -> None:
         """Linearise everything at the present state, and graph what is left of it."""
-        self.plain = None if associate or newton or slowed else beams
+        self.plain = None if associate or slowed else beams
         slowed = self.scales if beams and self.scales else slowed
         found = [None] * len(self.problem.scans) if associate else self.associations
-        how = {"associations": found, "newton": newton, "weighed": weighed, "slowed": slowed}
-        asked = {"associate": associate, "newton": newton}
+        how = {"associations": found, "weighed": weighed, "slowed": slowed}
+        asked = {"associate": associate}
         asked |= {"slowed": [(each.scale, each.kept) for each in slowed]}
         asked |= {"weighed": [each.scale for each in weighed]}
         worth = beams and bool(self.problem.scans)  # trackers and targets alone cost little
@@ -319,7 +309,6 @@ class Descent:
         values: Mapping[str, np.ndarray],
         beams: bool,
         associations: Sequence[Association | None] = (),
-        newton: bool = False,
         weighed: Sequence[Weighing] = (),
         slowed: Sequence[Weighing] = (),
     ) -> Callable[[], tuple[Linearisation, Graph]]:
@@ -332,7 +321,6 @@ class Descent:
                 problem,
                 values,
                 associations,
-                newton,
                 layout,
                 beams=beams,
                 weighed=weighed,

@@ -110,7 +110,7 @@ def by_variable(scan, rows, values):
     return d
 
 
-def stop_rows(case, scan, association, newton=False):
+def stop_rows(case, scan, association):
     """One stop's linear rows over the unknowns of a case."""
     placed = scan.stops.in_reference("lidar", case.values)
-    return StopRows.of(scan, Layout.of(case.problem), case.values, placed, association, newton)
+    return StopRows.of(scan, Layout.of(case.problem), case.values, placed, association)

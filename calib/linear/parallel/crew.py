@@ -23,6 +23,7 @@ from calib.linear.parallel.parcels import (
     Parcels,
     Task,
 )
+from calib.residuals.store import share_memory
 from chains.errors import CutShortError, InputError
 
 AHEAD = 2  # stops of each worker: one that it works on, and one that waits
@@ -53,10 +54,12 @@ class Line(Protocol):
 
 @cache
 def _mine() -> Parcels:
-    """What this process was sent. BLAS has one thread in it from now on, as everywhere."""
+    """What this process was sent. BLAS has one thread in it from now on, as everywhere; and other
+    workers may have the other cores of this machine."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(limits=1)
+    share_memory()
     return Parcels(KEPT_PARCELS_BYTES)
 
 

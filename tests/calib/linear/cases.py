@@ -61,10 +61,10 @@ class Case:
         blocks = (getattr(block, "weight", None) for block in blocks)
         return any(w is not None for w in blocks) or any(u.weight < 1 for u in unknowns)
 
-    def linear(self, newton: bool = False, gradients: Gradients | None = None) -> Linearisation:
+    def linear(self, gradients: Gradients | None = None) -> Linearisation:
         problem, given = self.start.problem, self.start.associations
         layout = Layout.of(problem, kept=self.held)
-        return linearise(problem, self.dense.values, given, newton, layout, gradients)
+        return linearise(problem, self.dense.values, given, layout, gradients)
 
     def estimate(self, linear: Linearisation) -> Estimate:
         """As a fit would leave it."""

@@ -36,14 +36,12 @@ class Dense:
         problem: what is estimated, surfaces' unknowns included.
         values: the state.
         associations: per scan, what its beams meet.
-        newton: whether curvature takes the place of weight.
         held: blocks beyond the problem's, each standing for its unknowns' priors.
     """
 
     problem: Problem
     values: Values
     associations: Sequence[Association]
-    newton: bool = False
     held: Collection[object] = ()
     A: np.ndarray = field(init=False)
     b: np.ndarray = field(init=False)
@@ -99,7 +97,7 @@ class Dense:
         """The rows of a stop, and which stop, mesh and surface (or plane) each errs with."""
         scan, association = self.problem.scans[number], self.associations[number]
         rows = scan.rows(self.values, association)
-        weight, residual = rows.whitened(self.newton)
+        weight, residual = rows.weight_m2, rows.residual_m
         root = np.sqrt(weight)
         placed = scan.stops.in_reference(scan.stops.rig.lidar_frame, self.values)
         by = {name: rows.by_twist @ d[0] for name, d in placed.d.items()} | dict(rows.dense)

@@ -240,7 +240,7 @@ class Groups:
         number = self.scans[group]
         rows = self.problem.scans[number].rows(self.dense.values, self.dense.associations[number])
         out = np.zeros((len(self.b), 6))
-        weight = np.sqrt(rows.whitened(self.dense.newton)[0])
+        weight = np.sqrt(rows.weight_m2)
         out[self.dense.rows_of[f"scan {number}"]] = weight[:, None] * rows.by_twist
         return out
 

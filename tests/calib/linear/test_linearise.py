@@ -1,7 +1,5 @@
 """The linearisation against dense rows: what is kept, the step, the covariance, and gradients."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -97,11 +95,9 @@ def test_what_is_touched_and_how_sure_beams_are(case, together):
     assert linear.weight_m2 == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("newton", [False, True])
-def test_the_step_of_every_unknown_is_that_of_dense_rows(case, together, newton):
+def test_the_step_of_every_unknown_is_that_of_dense_rows(case, together):
     """To a millionth of its sigma, and with it by how much the cost was to fall."""
-    dense = replace(case.dense, newton=newton)
-    linear = case.linear(newton)
+    dense, linear = case.dense, case.linear()
     estimate = case.estimate(linear)
     after, moved, fall = estimate.graph.step(dense.values)
     outer = linear.layout.outer()
@@ -209,7 +205,7 @@ def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, toget
     pairs = zip(case.start.problem.scans, case.start.associations, strict=True)
     for k, (scan, association) in enumerate(pairs):
         rows = scan.rows(dense.values, association)
-        weight, residual = rows.whitened(False)
+        weight, residual = rows.weight_m2, rows.residual_m
         twist = np.sqrt(weight)[:, None] * rows.by_twist
         mine = np.array([c is not None and c[0] == k for c in dense.cluster])
         A = dense.A[mine][: len(weight)]  # the rows of its scatter come after those of its beams

@@ -22,12 +22,12 @@ def on_planes(tmp_path_factory):
     return bent.on_planes(tmp_path_factory.mktemp("planes"))
 
 
-def summed(case, stops, newton=False):
+def summed(case, stops):
     """The normal equations (U + 1, U + 1) of some stops' sums; the right side is last."""
     size = sum(u.dim for u in case.problem.variables.values())
     total = np.zeros((size + 1, size + 1))
     for k in stops:
-        rows = stop_rows(case, case.problem.scans[k], case.association[k], newton)
+        rows = stop_rows(case, case.problem.scans[k], case.association[k])
         sums, count = rows.sums(), 7 + len(rows.columns)
         through = np.zeros((count, size + 1))
         through[:6, sums.chain_columns] = sums.chain
@@ -86,15 +86,6 @@ def test_rows_along_directions_are_the_rows_times_these(meeting, request):
     np.testing.assert_allclose(rows.along(directions)[felt], (A @ directions)[felt], atol=1e-9)
     np.testing.assert_array_equal(rows.b, b)
     np.testing.assert_allclose(rows.weight, weight, rtol=1e-12)
-
-
-@pytest.mark.parametrize("meeting", ["on_mesh", "on_planes"])
-def test_newtons_curvature_leaves_the_gradient_as_it_is(meeting, request):
-    case = request.getfixturevalue(meeting)
-    A, B = (summed(case, [0, 2], newton) for newton in (False, True))
-    size = np.sqrt(np.maximum(np.diag(A), 1e-30))[:-1]
-    np.testing.assert_allclose(B[:-1, -1] / size, A[:-1, -1] / size, atol=1e-9 * A[-1, -1] ** 0.5)
-    assert np.abs(B - A)[:-1, :-1].max() > 0.01 * np.abs(A).max()
 
 
 def test_a_corridor_leaves_its_own_direction_open(on_mesh):
