@@ -156,7 +156,7 @@ class Problem:
     def thinned(self, most: int) -> Problem:
         """The problem with so many beams of each scan at most."""
         every = [*self.scans, *self.aside]
-        few = {store: store.thinned(most) for store in {scan.store for scan in every}}
+        few = {store: store.thinned(most) for store in dict.fromkeys(s.store for s in every)}
         scans, aside = (
             [scan.read_from(few[scan.store]) for scan in some] for some in (self.scans, self.aside)
         )

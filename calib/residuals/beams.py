@@ -228,6 +228,13 @@ def effect_columns(
     return np.einsum("nd,ndp->np", by_site, basis)
 
 
+def zero_at(lost: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (N, ...) with 0 at the lost rows."""
+    out = np.array(values)
+    out[lost] = 0.0
+    return out
+
+
 def growth_columns(basis: np.ndarray | OneHot, rows: int) -> np.ndarray:
     """Derivative (rows, P) of the log sigma by the parameters of an effect on the noise."""
     if not isinstance(basis, OneHot):

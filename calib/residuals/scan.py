@@ -25,6 +25,7 @@ from calib.residuals.beams import (
     range_columns,
     site_error,
     turns_beams,
+    zero_at,
 )
 from calib.residuals.compiled import twist_derivative
 from calib.residuals.groups import Group
@@ -356,7 +357,7 @@ class ScanStop:
         dense = {name: c for name, c in found.items() if not isinstance(c, Columns)}
         sparse = [c for c in found.values() if isinstance(c, Columns)]
         sparse += seen.surface.unknown(t)
-        sparse = [replace(c, value=_without(c.value, lost)) for c in sparse]
+        sparse = [replace(c, value=zero_at(lost, c.value)) for c in sparse]
         sparse += [
             Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
             for name, index, size in seen.cells
@@ -385,13 +386,6 @@ class ScanStop:
             single = (PRIOR_COUNT * single + dof * measured) / (PRIOR_COUNT + dof)
         tangent2 = 1.0 / np.square(cosine) - 1.0
         return single / scan.count + (self.lidar.sigma_angle_rad * t) ** 2 * tangent2
-
-
-def _without(values: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """Values (N, ...) with 0 at the lost rows."""
-    out = np.array(values)
-    out[lost] = 0.0
-    return out
 
 
 def _finite(basis: np.ndarray | OneHot, usable: np.ndarray) -> np.ndarray | OneHot:

@@ -44,12 +44,6 @@ class Start:
         known = {key: self.state.get(f"{key}{SD}") for key in spread_of(problem)}
         return {key: float(sd) for key, sd in known.items() if sd is not None}
 
-    @property
-    def anew(self) -> Start:
-        """The same, with nothing known of what beams met."""
-        state = {n: x for n, x in self.state.items() if not n.endswith(SEEN)}
-        return Start(state, aside=self.aside)
-
     def without(self, names: Collection[str]) -> Start:
         """The same, with nothing known of some unknowns."""
         gone = {f"{name}{ending}" for name in names for ending in ("", DOFS, SEEN)}
@@ -118,6 +112,11 @@ class Estimate:
         pairs = zip(self.scans, self.associations, strict=True)
         met = {key_of(scan): met.part for scan, met in pairs}
         return Start(self.state, met, self.problem.set_aside)
+
+    @property
+    def anew(self) -> Start:
+        """The same, with nothing known of what beams met."""
+        return Start(replace(self, seen={}).state, aside=self.problem.set_aside)
 
     @property
     def state(self) -> dict[str, np.ndarray]:

@@ -116,7 +116,7 @@ def _by_few_first(
         return None
     if not few.converged:
         return None
-    loop = Loop(problem, prior, progress, few.start.anew)
+    loop = Loop(problem, prior, progress, few.anew)
     loop.take_weights()
     _arrive(loop, tolerance)
     estimate = loop.estimate(tolerance if spread else None)
