@@ -109,9 +109,13 @@ class Linear:
         )
 
 
-def beams_looked_at(problem: Problem) -> int:
-    """About how many beams of each scan, at most, tell what is missing."""
-    return max(LOOKED_BEAMS // max(len(problem.scans), 1), FEWEST_LOOKED)
+def beams_looked_at(associations: Sequence[Association]) -> int:
+    """How many beams of each scan, at most, tell what is missing; of scans with fewer, all do."""
+    met = np.sort([np.count_nonzero(each.part >= 0) for each in associations])
+    before = np.concatenate([[0], np.cumsum(met)[:-1]])
+    level = (LOOKED_BEAMS - before) // np.arange(len(met), 0, -1)  # if those before have fewer
+    some = level[level < met]
+    return max(int(some[0]) if len(some) else LOOKED_BEAMS, FEWEST_LOOKED)
 
 
 def rows_along(
@@ -147,7 +151,7 @@ def rows_along(
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    most, count = beams_looked_at(wide), away.shape[1]
+    most, count = beams_looked_at(estimate.associations), away.shape[1]
     cells = np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
     if cells * count**2 > JUDGING_NUMBERS:
         most = min(most, max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN))

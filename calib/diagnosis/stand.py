@@ -179,7 +179,7 @@ class Stand:
         wide = self.problem_of(self.model.plus(tuple(candidates)))
         variables = variables_of(wide, {e.name for e in candidates})
         every = [*chain(*variables.values())]
-        most = most or beams_looked_at(wide)
+        most = most or beams_looked_at(self.estimate.associations)
         linear = linearise_with(wide, self.estimate, every, progress, most)
         at, start = {}, 0
         for name, theirs in variables.items():

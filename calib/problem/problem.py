@@ -153,15 +153,6 @@ class Problem:
         ]
         return replace(self, scans=kept, aside=gone, blocks=blocks)
 
-    def thinned(self, most: int) -> Problem:
-        """The problem with so many beams of each scan at most."""
-        every = [*self.scans, *self.aside]
-        few = {store: store.thinned(most) for store in dict.fromkeys(s.store for s in every)}
-        scans, aside = (
-            [scan.read_from(few[scan.store]) for scan in some] for some in (self.scans, self.aside)
-        )
-        return replace(self, scans=scans, aside=aside)
-
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
         """Add an unknown once; it starts at `value`, or at its mean."""
         if unknown.name not in self.variables:

@@ -188,12 +188,8 @@ class ScanStop:
         if np.count_nonzero(met >= 0) <= most:
             return self, association, None
         at, times = drawn_of_each(met, most, self.index)
-        return self.read_from(SomeBeams(self.store, at)), association.only(at), times
-
-    def read_from(self, store: BeamStore | SomeBeams) -> ScanStop:
-        """The same stop with the beams of another store of its scans; how bright is usual, all of
-        them tell."""
-        return replace(self, store=store, alike=self.alike or (self.store,))
+        store, alike = SomeBeams(self.store, at), self.alike or (self.store,)
+        return replace(self, store=store, alike=alike), association.only(at), times
 
     def ranges(self, values: Values) -> Ranges:
         """Every beam that meets the surface, before and after what the effects correct."""

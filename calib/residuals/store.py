@@ -49,13 +49,11 @@ class BeamStore:
         recording: whose.
         beam_origin_m: (2,) of its LiDAR, radial and tangential.
         most: how many beams of each scan there are at most; all where None.
-        whole: the store that these few are taken from, if there is one; all of them are kept.
     """
 
     recording: RecordedStops
     beam_origin_m: tuple[float, float]
     most: int | None = None
-    whole: BeamStore | None = None
     _kept: dict[int, tuple[Scan, Beams]] = field(default_factory=dict, repr=False)
     _bytes: float = 0.0
     _lock: Lock = field(default_factory=Lock, repr=False)
@@ -76,7 +74,7 @@ class BeamStore:
         size = _size(found)
         with self._lock:
             full = sum(store._bytes for store in list(_STORES)) + size > KEPT_BYTES
-            if stop not in self._kept and (self.whole is not None or not full):
+            if stop not in self._kept and not full:
                 self._kept[stop] = found
                 self._bytes += size
         return found
@@ -85,12 +83,8 @@ class BeamStore:
         """A scan, to look at once: it takes no place of those that are asked for in each pass."""
         if stop in self._kept:
             return self._kept[stop][0]
-        scan = self.recording.scan(stop) if self.whole is None else self.whole.read(stop)[0]
+        scan = self.recording.scan(stop)
         return scan if self.most is None else _thinned(scan, self.most, stop)
-
-    def thinned(self, most: int) -> BeamStore:
-        """The same with so many beams of each scan at most."""
-        return BeamStore(self.recording, self.beam_origin_m, most, whole=self)
 
     @cached_property
     def median_intensity(self) -> float:
@@ -105,7 +99,7 @@ class BeamStore:
 
     def __getstate__(self) -> dict[str, object]:
         """Without what was read: another process reads for itself."""
-        return {n: getattr(self, n) for n in ("recording", "beam_origin_m", "most", "whole")}
+        return {n: getattr(self, n) for n in ("recording", "beam_origin_m", "most")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)

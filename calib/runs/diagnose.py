@@ -258,12 +258,13 @@ def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
 
 def _beams_drawn(stand: Stand) -> list[str]:
     """How many of the beams what is missing was looked for in, if not in all."""
-    met = np.array([np.count_nonzero(met.part >= 0) for met in stand.estimate.associations])
-    used = np.minimum(met, beams_looked_at(stand.problem)).sum()
+    associations = stand.estimate.associations
+    met = np.array([np.count_nonzero(each.part >= 0) for each in associations], int)
+    used = np.minimum(met, beams_looked_at(associations)).sum()
     if used == met.sum():
         return []
-    share = f"{used / 1e6:.1f} of {met.sum() / 1e6:.1f} million beams"
-    return [f"What is missing was looked for in {share}, drawn evenly from every scan."]
+    share = f"{used:,} of {met.sum():,} beams"
+    return [f"What is missing was looked for in {share}, drawn evenly from every surface."]
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

@@ -114,11 +114,6 @@ class Estimate:
         return Start(self.state, met, self.problem.set_aside)
 
     @property
-    def anew(self) -> Start:
-        """The same, with nothing known of what beams met."""
-        return Start(replace(self, seen={}).state, aside=self.problem.set_aside)
-
-    @property
     def state(self) -> dict[str, np.ndarray]:
         """All values; per vector ``NAME.dofs``, its parameters; ``NAME.seen``, the value at which
         the scans were associated; and ``KEY.sd``, how widely things scatter by chance."""

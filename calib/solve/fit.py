@@ -21,9 +21,6 @@ from calib.solve.reweight import reweighted
 from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
 
-# Beams of each scan that a fit begins with, and how many times as many are all of them where that
-# pays: choices. Of 13 to 18 passes over 24 and 360 scans of 131,072 beams 6 to 11 are left.
-FEW_BEAMS, DENSE = 4096, 8
 ROUNDED = 1e-6  # of a cost: how far apart a fit's end and a look at it may be
 
 __all__ = ["CONVERGED", "Progress", "preview", "resume", "solve"]
@@ -63,9 +60,6 @@ def solve(
     """
     if not problem.calibration:
         raise InputError("nothing is left to estimate: fix fewer names, or choose an effect")
-    anew = not (start and start.state)
-    if anew and (found := _by_few_first(problem, prior, tolerance, progress, spread)):
-        return found
     loop = Loop(problem, prior, progress, start)
     if loop.start.state:
         loop.take_weights()
@@ -88,39 +82,6 @@ def solve(
     elif loop.start.state:
         _stay_below(loop, lambda: loop.descend(STEADY, beams=False))
     return _not_raised(loop, loop.estimate(tolerance if spread else None))
-
-
-def is_dense(problem: Problem) -> bool:
-    """Whether scans have so many beams that few of them lead to near the optimum first: the first
-    scans of all recordings, on average."""
-    first = {scan.store: scan.index for scan in reversed(problem.scans)}
-    counts = [len(store.read(index)[0].ring) for store, index in first.items()]
-    return bool(counts) and np.mean(counts) > DENSE * FEW_BEAMS
-
-
-def _by_few_first(
-    problem: Problem, prior: Block | None, tolerance: float, progress: Progress, spread: bool
-) -> Estimate | None:
-    """The optimum by all beams of dense scans, from that by few of each, which costs next to
-    nothing; None where either fit does not converge, or scans are not dense. Arguments as of
-    `solve`."""
-    if not is_dense(problem):
-        return None
-
-    def tell(what: str, done: int, total: int) -> None:
-        progress(f"{what}, few beams", done, total)
-
-    try:
-        few = solve(problem.thinned(FEW_BEAMS), prior, tolerance, tell, spread=spread)
-    except InputError:  # of a scan that hardly meets anything, few beams may meet nothing
-        return None
-    if not few.converged:
-        return None
-    loop = Loop(problem, prior, progress, few.anew)
-    loop.take_weights()
-    _arrive(loop, tolerance)
-    estimate = loop.estimate(tolerance if spread else None)
-    return estimate if estimate.converged else None
 
 
 def _without_scans(loop: Loop, problem: Problem, turns: bool) -> None:
