@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from chains.errors import InputError
 from sensors.meshes import ray_caster, read_mesh
-from sensors.surfaces import SurfaceGrid, connected_surfaces, transverse, triangle_planes
+from sensors.surfaces import SurfaceGrid, Ways, connected_surfaces, transverse, triangle_planes
 
 # A probe that lands further than this from the plane of the hit has crossed a depth edge.
 DEPTH_STEP_M = 0.02
@@ -208,7 +208,13 @@ class Reference:
         """
         return connected_surfaces(self.vertices_m, self.triangles, self._normal, self.label)
 
-    def patch(self, triangle: np.ndarray, point_m: np.ndarray, size_m: float = 0.7) -> np.ndarray:
+    def patch(
+        self,
+        triangle: np.ndarray,
+        point_m: np.ndarray,
+        size_m: float = 0.7,
+        by_way: bool = False,
+    ) -> np.ndarray:
         """Patch (N,) int64 of each hit: a cell of about `size_m` of its surface's tangent plane.
 
         Patches are counted over all surfaces; -1 where the beam missed.
@@ -217,10 +223,15 @@ class Reference:
             triangle: (N,) that was hit; -1 for none.
             point_m: (N, 3) where.
             size_m: about how wide a patch is.
+            by_way: whether those of curved surfaces are apart by the way that they face.
         """
         patch = np.full(len(triangle), -1, dtype=np.int64)
         hit = np.flatnonzero(triangle >= 0)
-        patch[hit] = self._grid.patch(self.surface[triangle[hit]], point_m[hit], size_m)
+        mine = triangle[hit]
+        patch[hit] = self._grid.patch(self.surface[mine], point_m[hit], size_m)
+        if by_way:
+            cells = self._grid.patches(size_m)
+            patch[hit] = self._ways.patch(patch[hit], mine, self.surface[mine], cells)
         return patch
 
     def facts(self, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -228,8 +239,10 @@ class Reference:
         surface = np.where(triangle >= 0, self.surface[triangle], -1)
         return self._label[triangle], self._intensity[triangle], surface
 
-    def patch_surface(self, size_m: float = 0.7) -> np.ndarray:
+    def patch_surface(self, size_m: float = 0.7, by_way: bool = False) -> np.ndarray:
         """Surface (P,) int64 of every patch that `patch` can return for that size."""
+        if by_way:
+            return self._ways.surfaces(self._grid.patches(size_m))
         return self._grid.patch_surface(size_m)
 
     def surface_centre_m(self, surface: int) -> np.ndarray:
@@ -241,14 +254,20 @@ class Reference:
     def patch_centre_m(self, patch: int, size_m: float) -> np.ndarray:
         """The middle (3,) of a patch of that size: the centre of the triangles in it, or of its
         cell where these are larger."""
-        surface, middle_m = self._grid.centre(patch, size_m)
+        whole = self._ways.whole(patch, self._grid.patches(size_m))
+        surface, middle_m = self._grid.centre(whole, size_m)
         mine = np.flatnonzero(self.surface == surface)
         middles_m = self.vertices_m[self.triangles[mine]].mean(axis=1)
-        here = (self.patch(mine, middles_m, size_m) == patch) & (self.area_m2[mine] > 0)
+        there = self.patch(mine, middles_m, size_m, by_way=patch != whole)
+        here = (there == patch) & (self.area_m2[mine] > 0)
         if here.any():
             return np.average(middles_m[here], axis=0, weights=self.area_m2[mine[here]])
         axes, centre_m = self._grid.axes[surface], self.surface_centre_m(surface)
         return centre_m + (middle_m - axes @ centre_m) @ axes
+
+    @cached_property
+    def _ways(self) -> Ways:
+        return Ways.over(self._normal, self.area_m2, self.surface)
 
     @property
     def _normal(self) -> np.ndarray:

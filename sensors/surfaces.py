@@ -12,6 +12,12 @@ THINNEST_TRIANGLE_M = 1e-9
 SAME_VERTEX_M = 1e-6
 # Across an edge that turns more than this, another surface begins.
 SMOOTH_TURN_RAD = np.radians(30.0)
+# A surface is curved whose normals stand off their main direction by more than this, rms: a choice.
+# Noise of a scanned wall turns its triangles by up to 5 degrees, a curtain turns by 20.
+CURVED_RAD = np.radians(10.0)
+# How far unit normals that face the same way are apart at most, along two axes: a choice. Across a
+# curtain's waves that makes nine ways.
+WAY = 0.1
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -65,10 +71,8 @@ class SurfaceGrid:
 
         The tangent plane stands across the main direction of the surface's normals, by area.
         """
-        count = int(surface.max()) + 1
-        moment = np.zeros((count, 3, 3))
-        np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
-        main = np.linalg.eigh(moment)[1][:, :, -1]
+        main = np.linalg.eigh(_moments(normal, area_m2, surface))[1][:, :, -1]
+        count = len(main)
         side = transverse(main)
         axes = np.stack([side, np.cross(main, side)], axis=1)
         place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
@@ -90,10 +94,13 @@ class SurfaceGrid:
         row, column = np.clip(steps, 0, last).astype(np.int64).T
         return first.take(surface) + row * (last[:, 1] + 1) + column
 
+    def patches(self, cell_m: float) -> np.ndarray:
+        """How many patches (S,) each surface has."""
+        return self._cells(cell_m).prod(axis=1)
+
     def patch_surface(self, cell_m: float) -> np.ndarray:
         """Surface (P,) int64 of every patch."""
-        cells = self._cells(cell_m)
-        return np.repeat(np.arange(len(cells)), cells.prod(axis=1))
+        return np.repeat(np.arange(len(self.size_m)), self.patches(cell_m))
 
     def centre(self, patch: int, cell_m: float) -> tuple[int, np.ndarray]:
         """The surface that a patch is of, and its middle (2,) along that one's axes."""
@@ -105,6 +112,72 @@ class SurfaceGrid:
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""
         return np.maximum(1, np.rint(self.size_m / cell_m)).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Which way each of F triangles faces, on those of S surfaces that are curved."""
+
+    way: np.ndarray  # (F,) its number among the ways of its surface; 0 on a flat one
+    count: np.ndarray  # (S,) how many ways a surface faces; 1 of a flat one
+
+    @classmethod
+    def over(cls, normal: np.ndarray, area_m2: np.ndarray, surface: np.ndarray) -> "Ways":
+        """Of triangles: unit normals (F, 3), areas (F,), surfaces (F,)."""
+        values, axes = np.linalg.eigh(_moments(normal, area_m2, surface))
+        total = np.maximum(values.sum(axis=1), 1e-300)
+        curved = 1.0 - values[:, -1] / total > np.sin(CURVED_RAD) ** 2
+        way, count = np.zeros(len(surface), np.int64), np.ones(len(axes), np.int64)
+        mine = np.flatnonzero(curved[surface])
+        along = np.einsum("fij,fi->fj", axes[surface[mine]], normal[mine])
+        steps = np.column_stack([surface[mine], np.rint(along[:, :2] / WAY), along[:, 2] > 0])
+        each, at = np.unique(steps, axis=0, return_inverse=True)
+        of = each[:, 0].astype(np.int64)
+        way[mine] = at.ravel() - np.searchsorted(of, surface[mine])
+        count[curved] = np.maximum(np.bincount(of, minlength=len(axes))[curved], 1)
+        return cls(way, count)
+
+    def patch(
+        self, whole: np.ndarray, triangle: np.ndarray, surface: np.ndarray, cells: np.ndarray
+    ) -> np.ndarray:
+        """Patches (N,) of curved surfaces apart by the way that they face: these are counted after
+        all others.
+
+        Args:
+            whole: (N,) patches of all surfaces.
+            triangle, surface: (N,) where.
+            cells: (S,) how many patches each surface has.
+        """
+        first, start = np.cumsum(cells) - cells, self._start(cells)
+        parts = start[surface] + (whole - first[surface]) * self.count[surface]
+        return np.where(self.count[surface] > 1, parts + self.way[triangle], whole)
+
+    def surfaces(self, cells: np.ndarray) -> np.ndarray:
+        """The surface (P,) of every patch, those that are apart included."""
+        every = np.arange(len(cells))
+        return np.concatenate([np.repeat(every, cells), np.repeat(every, self._apart(cells))])
+
+    def whole(self, patch: int, cells: np.ndarray) -> int:
+        """The patch of which that one is a part; of others, itself."""
+        if patch < cells.sum():
+            return patch
+        surface, start = int(self.surfaces(cells)[patch]), self._start(cells)
+        first = int(cells[:surface].sum())
+        return first + (patch - int(start[surface])) // int(self.count[surface])
+
+    def _apart(self, cells: np.ndarray) -> np.ndarray:
+        return np.where(self.count > 1, cells * self.count, 0)
+
+    def _start(self, cells: np.ndarray) -> np.ndarray:
+        apart = self._apart(cells)
+        return cells.sum() + np.cumsum(apart) - apart
+
+
+def _moments(normal: np.ndarray, area_m2: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Products (S, 3, 3) of the normals of each surface, by area."""
+    out = np.zeros((int(surface.max()) + 1, 3, 3))
+    np.add.at(out, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
+    return out
 
 
 def transverse(directions: np.ndarray) -> np.ndarray:

@@ -81,7 +81,7 @@ class MeshSurface:
         """The surface that each of those parts is of; a surface is its own."""
         if kind == SURFACE:
             return parts
-        return self.reference.patch_surface(self.patches_m[kind])[parts]
+        return self.reference.patch_surface(self.patches_m[kind], kind == PATCH)[parts]
 
     def surfaces(self, association: Association) -> np.ndarray:
         """The surface (N,) that each beam meets, -1 for none."""
@@ -112,10 +112,7 @@ class MeshSurface:
         part that is left out."""
         part = self._kept(T, beams, part)
         met = _Met(T, beams, self.reference.planes, part)
-        patches = {
-            kind: self._patch(met, size_m).astype(np.int32)
-            for kind, size_m in self.patches_m.items()
-        }
+        patches = {kind: self._patch(met, kind).astype(np.int32) for kind in self.patches_m}
         return Association(part, patches)
 
     def meet(
@@ -129,8 +126,8 @@ class MeshSurface:
             "reference_intensity": lambda: facts()[1],
             "surface": lambda: facts()[2],
         }
-        for kind, size_m in self.patches_m.items():
-            columns[kind] = partial(self._patch, met, size_m)
+        for kind in self.patches_m:
+            columns[kind] = partial(self._patch, met, kind)
         return met.surface(columns | association.patches)
 
     def _kept(self, T: np.ndarray, beams: Beams, triangle: np.ndarray) -> np.ndarray:
@@ -145,10 +142,13 @@ class MeshSurface:
         if kind == SURFACE:
             return self.reference.facts(triangle)[2]
         met = _Met(T, beams, self.reference.planes, triangle)
-        return self._patch(met, self.patches_m[kind])
+        return self._patch(met, kind)
 
-    def _patch(self, met: _Met, size_m: float) -> np.ndarray:
-        return self.reference.patch(met.part, met.point_m, size_m)
+    def _patch(self, met: _Met, kind: str) -> np.ndarray:
+        """Patches (N,) of a kind. The finest are apart by the way that they face: where a curved
+        surface stands elsewhere as a whole, its offset along the normal is not everywhere the same,
+        and would be one of the whole mesh instead."""
+        return self.reference.patch(met.part, met.point_m, self.patches_m[kind], kind == PATCH)
 
 
 @dataclass(frozen=True)
@@ -327,7 +327,9 @@ def part_counts(reference: Reference) -> dict[str, int]:
     """How many parts of each kind a mesh has, counted from 0."""
     surfaces = {SURFACE: int(reference.surface.max()) + 1}
     widths_m = patch_widths_m(reference).items()
-    return surfaces | {kind: len(reference.patch_surface(size_m)) for kind, size_m in widths_m}
+    return surfaces | {
+        kind: len(reference.patch_surface(size_m, kind == PATCH)) for kind, size_m in widths_m
+    }
 
 
 def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str, float]:
