@@ -17,7 +17,7 @@ SMOOTH_TURN_RAD = np.radians(30.0)
 CURVED_RAD = np.radians(10.0)
 # How far unit normals that face the same way are apart at most, along two axes: a choice. Across a
 # curtain's waves that makes nine ways.
-WAY = 0.1
+ONE_WAY = 0.1
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +130,7 @@ class Ways:
         way, count = np.zeros(len(surface), np.int64), np.ones(len(axes), np.int64)
         mine = np.flatnonzero(curved[surface])
         along = np.einsum("fij,fi->fj", axes[surface[mine]], normal[mine])
-        steps = np.column_stack([surface[mine], np.rint(along[:, :2] / WAY), along[:, 2] > 0])
+        steps = np.column_stack([surface[mine], np.rint(along[:, :2] / ONE_WAY), along[:, 2] > 0])
         each, at = np.unique(steps, axis=0, return_inverse=True)
         of = each[:, 0].astype(np.int64)
         way[mine] = at.ravel() - np.searchsorted(of, surface[mine])

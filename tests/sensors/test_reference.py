@@ -250,6 +250,45 @@ def test_patches_are_even_cells_of_one_surface(room):
     assert len(room.patch_surface(0.7)) == 2 * (6 * 4 + 6 * 4 + 4 * 4)
 
 
+def curtain(wave_m=0.03, noise_m=0.0):
+    """A sheet of 2 m with five waves across it."""
+    vertices, triangles = sheet([0, 0, 0], [2, 0, 0], [0, 0, 2], steps=60)
+    rng = np.random.default_rng(3)
+    vertices[:, 1] += wave_m * np.sin(5 * np.pi * vertices[:, 0])
+    vertices[:, 1] += noise_m * rng.standard_normal(len(vertices))
+    return vertices, triangles
+
+
+def test_patches_of_a_curved_surface_are_apart_by_the_way_they_face():
+    """What a shift of the whole does to the offset along the normal is nearly even on each; and the
+    numbers of all other patches are as they were."""
+    mesh = Reference(*together(curtain(), sheet([0, 3, 0], [2, 0, 0], [0, 0, 2], steps=20)))
+    triangle = np.arange(len(mesh.triangles))
+    middle_m = mesh.vertices_m[mesh.triangles].mean(axis=1)
+    whole = mesh.patch(triangle, middle_m, 0.5)
+    parts = mesh.patch(triangle, middle_m, 0.5, by_way=True)
+    flat = middle_m[:, 1] > 2.0
+    np.testing.assert_array_equal(parts[flat], whole[flat])
+    assert (parts[~flat] > whole.max()).all()
+    owner = mesh.patch_surface(0.5, by_way=True)
+    np.testing.assert_array_equal(owner[parts], mesh.surface)
+    np.testing.assert_array_equal(owner[: len(mesh.patch_surface(0.5))], mesh.patch_surface(0.5))
+    normal = mesh.planes[:-1, :3]
+    for part in np.unique(parts[~flat]):
+        here = parts == part
+        assert len(np.unique(whole[here])) == 1
+        assert np.ptp(normal[here], axis=0).max() < 0.11
+        centre_m = mesh.patch_centre_m(int(part), 0.5)
+        np.testing.assert_allclose(centre_m, middle_m[here].mean(axis=0), atol=0.01)
+    assert 6 <= len(np.unique(parts[~flat])) / len(np.unique(whole[~flat])) <= 12
+
+
+def test_a_noisy_wall_is_not_curved():
+    """Noise of 1 mm turns triangles of 33 mm by 4 degrees."""
+    mesh = Reference(*curtain(wave_m=0.0, noise_m=0.001))
+    np.testing.assert_array_equal(mesh.patch_surface(0.5, by_way=True), mesh.patch_surface(0.5))
+
+
 def test_patches_of_a_plane_extended_and_of_misses(room):
     directions = random_directions(100)
     hits = room.cast(STATION_M, directions)
