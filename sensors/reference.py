@@ -267,7 +267,8 @@ class Reference:
 
     @cached_property
     def _ways(self) -> Ways:
-        return Ways.over(self._normal, self.area_m2, self.surface)
+        middle_m = self.vertices_m[self.triangles].mean(axis=1)
+        return Ways.over(middle_m, self._normal, self.area_m2, self.surface)
 
     @property
     def _normal(self) -> np.ndarray:
