@@ -223,7 +223,7 @@ class Reference:
             triangle: (N,) that was hit; -1 for none.
             point_m: (N, 3) where.
             size_m: about how wide a patch is.
-            by_way: whether those of curved surfaces are apart by the way that they face.
+            by_way: whether patches of curved surfaces are divided by the way that they face.
         """
         patch = np.full(len(triangle), -1, dtype=np.int64)
         hit = np.flatnonzero(triangle >= 0)
@@ -254,7 +254,8 @@ class Reference:
     def patch_centre_m(self, patch: int, size_m: float) -> np.ndarray:
         """The middle (3,) of a patch of that size: the centre of the triangles in it, or of its
         cell where these are larger."""
-        whole = self._ways.whole(patch, self._grid.patches(size_m))
+        cells = self._grid.patches(size_m)
+        whole = patch if patch < cells.sum() else self._ways.whole(patch, cells)
         surface, middle_m = self._grid.centre(whole, size_m)
         mine = np.flatnonzero(self.surface == surface)
         middles_m = self.vertices_m[self.triangles[mine]].mean(axis=1)
@@ -268,7 +269,7 @@ class Reference:
     @cached_property
     def _ways(self) -> Ways:
         middle_m = self.vertices_m[self.triangles].mean(axis=1)
-        return Ways.over(middle_m, self._normal, self.area_m2, self.surface)
+        return Ways.over(self._grid.axes, middle_m, self._normal, self.area_m2, self.surface)
 
     @property
     def _normal(self) -> np.ndarray:

@@ -18,9 +18,10 @@ SMOOTHED_M = 0.05
 # A surface is curved whose normals stand off their main direction by more than this, rms: a choice.
 # A curtain's do by 18 degrees.
 CURVED_RAD = np.radians(10.0)
-# How far unit normals that face the same way are apart at most, along two axes: a choice. Across a
-# curtain's waves that makes nine ways.
-ONE_WAY = 0.1
+# How far unit normals that face the same way are apart at most, along two axes: a choice, which
+# makes nine ways of the waves of a curtain; and how many ways a surface faces at most, as where
+# coarse triangles are so noisy that each faces its own.
+ONE_WAY, MOST_WAYS = 0.1, 32
 
 
 def triangle_planes(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,8 +75,10 @@ class SurfaceGrid:
 
         The tangent plane stands across the main direction of the surface's normals, by area.
         """
-        main = np.linalg.eigh(_moments(normal, area_m2, surface))[1][:, :, -1]
-        count = len(main)
+        count = int(surface.max()) + 1
+        moment = np.zeros((count, 3, 3))
+        np.add.at(moment, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
+        main = np.linalg.eigh(moment)[1][:, :, -1]
         side = transverse(main)
         axes = np.stack([side, np.cross(main, side)], axis=1)
         place_m = np.einsum("fki,fci->fck", axes[surface], corners_m)
@@ -119,48 +122,47 @@ class SurfaceGrid:
 
 @dataclass(frozen=True)
 class Ways:
-    """Which way each of F triangles faces, on those of S surfaces that are curved."""
+    """Which way each of F triangles faces, on those of S surfaces that are curved. One that is
+    wound otherwise than its neighbours faces another way."""
 
     way: np.ndarray  # (F,) its number among the ways of its surface; 0 on a flat one
     count: np.ndarray  # (S,) how many ways a surface faces; 1 of a flat one
 
     @classmethod
     def over(
-        cls, middle_m: np.ndarray, normal: np.ndarray, area_m2: np.ndarray, surface: np.ndarray
+        cls,
+        axes: np.ndarray,
+        middle_m: np.ndarray,
+        normal: np.ndarray,
+        area_m2: np.ndarray,
+        surface: np.ndarray,
     ) -> "Ways":
-        """Of triangles: middles and unit normals (F, 3), areas (F,), surfaces (F,)."""
-        axes = np.linalg.eigh(_moments(normal, area_m2, surface))[1]
-        along = np.einsum("fij,fi->fj", axes[surface], normal)  # the last along the main direction
-        place = np.einsum("fij,fi->fj", axes[surface][:, :, :2], middle_m)
-        cell = [surface, along[:, 2] > 0, *np.floor(place / SMOOTHED_M).T]
-        _, at = np.unique(np.stack(cell), axis=1, return_inverse=True)
-        sums = np.stack([np.bincount(at.ravel(), area_m2 * each) for each in along.T], axis=1)
-        smooth = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None]
-        along = smooth[at.ravel()]
+        """Of surfaces with these axes (S, 2, 3), and triangles: middles and unit normals (F, 3),
+        areas (F,), surfaces (F,)."""
+        axes = np.concatenate([axes, np.cross(axes[:, 0], axes[:, 1])[:, None]], axis=1)[surface]
+        along = np.einsum("fij,fj->fi", axes, normal)  # the last along the main direction
+        cell = np.floor(np.einsum("fij,fj->fi", axes[:, :2], middle_m) / SMOOTHED_M)
+        along = _averages(along, area_m2, np.column_stack([surface, along[:, 2] > 0, cell]))
         spread = np.bincount(surface, area_m2 * np.square(along[:, :2]).sum(axis=1))
-        total = np.maximum(np.bincount(surface, area_m2), 1e-300)
-        curved = spread > np.sin(CURVED_RAD) ** 2 * total
-        way, count = np.zeros(len(surface), np.int64), np.ones(len(axes), np.int64)
+        curved = spread > np.sin(CURVED_RAD) ** 2 * np.bincount(surface, area_m2)
+        way, count = np.zeros(len(surface), np.int64), np.ones(len(curved), np.int64)
         mine = np.flatnonzero(curved[surface])
-        steps = np.column_stack(
-            [surface[mine], np.rint(along[mine, :2] / ONE_WAY), along[mine, 2] > 0]
-        )
-        each, at = np.unique(steps, axis=0, return_inverse=True)
-        of = each[:, 0].astype(np.int64)
-        way[mine] = at.ravel() - np.searchsorted(of, surface[mine])
-        count[curved] = np.maximum(np.bincount(of, minlength=len(axes))[curved], 1)
+        mine = mine[np.argsort(surface[mine], kind="stable")]
+        for some in np.split(mine, np.flatnonzero(np.diff(surface[mine])) + 1) if len(mine) else ():
+            way[some] = _ways(along[some])
+            count[surface[some[0]]] = way[some].max() + 1
         return cls(way, count)
 
     def patch(
         self, whole: np.ndarray, triangle: np.ndarray, surface: np.ndarray, cells: np.ndarray
     ) -> np.ndarray:
-        """Patches (N,) of curved surfaces apart by the way that they face: these are counted after
-        all others.
+        """Patches (N,), those of curved surfaces divided by the way that they face. The parts are
+        counted after all patches that are whole.
 
         Args:
-            whole: (N,) patches of all surfaces.
-            triangle, surface: (N,) where.
-            cells: (S,) how many patches each surface has.
+            whole: (N,) patches as the grid has them.
+            triangle, surface: (N,) on which each is.
+            cells: (S,) how many patches the grid has on each surface.
         """
         first, start = np.cumsum(cells) - cells, self._start(cells)
         parts = start[surface] + (whole - first[surface]) * self.count[surface]
@@ -172,9 +174,7 @@ class Ways:
         return np.concatenate([np.repeat(every, cells), np.repeat(every, self._apart(cells))])
 
     def whole(self, patch: int, cells: np.ndarray) -> int:
-        """The patch of which that one is a part; of others, itself."""
-        if patch < cells.sum():
-            return patch
+        """The patch of which that one is a part."""
         surface, start = int(self.surfaces(cells)[patch]), self._start(cells)
         first = int(cells[:surface].sum())
         return first + (patch - int(start[surface])) // int(self.count[surface])
@@ -187,11 +187,22 @@ class Ways:
         return cells.sum() + np.cumsum(apart) - apart
 
 
-def _moments(normal: np.ndarray, area_m2: np.ndarray, surface: np.ndarray) -> np.ndarray:
-    """Products (S, 3, 3) of the normals of each surface, by area."""
-    out = np.zeros((int(surface.max()) + 1, 3, 3))
-    np.add.at(out, surface, np.einsum("f,fi,fj->fij", area_m2, normal, normal))
-    return out
+def _averages(normal: np.ndarray, area_m2: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Unit normals (F, 3), each that of all in its cell (F, k), by area."""
+    _, at = np.unique(cell, axis=0, return_inverse=True)
+    sums = np.stack([np.bincount(at.ravel(), area_m2 * each) for each in normal.T], axis=1)
+    return (sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None])[at.ravel()]
+
+
+def _ways(normal: np.ndarray) -> np.ndarray:
+    """Numbers (F,) of the ways that triangles of one surface face, by normals (F, 3) along its
+    axes; coarser ones where there would be too many."""
+    width, number = ONE_WAY, np.full(1, MOST_WAYS)
+    while number.max() >= MOST_WAYS:
+        steps = np.column_stack([np.rint(normal[:, :2] / width), normal[:, 2] > 0])
+        number = np.unique(steps, axis=0, return_inverse=True)[1].ravel()
+        width *= 2.0
+    return number
 
 
 def transverse(directions: np.ndarray) -> np.ndarray:

@@ -36,11 +36,11 @@ from calib.solve.reweight import weighted_as
 # widened by this factor: what only a prior could tell from a candidate then counts as a gauge.
 WIDENED = 100.0
 # Beams of all scans together that tell what is missing, and of each scan at any rate; all, if they
-# are no more. Both are choices: what so many beams of 2 mm do not show of 128 parameters is below
-# 0.03 mm, and errors of stops and of the mesh are larger.
-LOOKED_BEAMS, FEWEST_LOOKED = 2**20, 4096
-# All of these judge a candidate if their rows take no more numbers than this (268 MB), one for each
-# direction: of each stop and surface no more rows are kept than there are directions.
+# are no more. Both are choices: the sigma of one of 128 parameters by four million beams of 2 mm is
+# 0.01 mm, and errors of stops and of the mesh are larger.
+LOOKED_BEAMS, FEWEST_LOOKED = 2**22, 4096
+# All beams looked at judge a candidate if their rows take no more numbers than this (268 MB), one
+# for each direction: of each stop and surface no more rows are kept than there are directions.
 JUDGING_NUMBERS = 2**25
 # Else beams are drawn whose rows take so many numbers, and at least so many of each stop; both are
 # choices. By n beams that tell of a direction, the variance of a score of k sigmas in it is told
@@ -72,6 +72,7 @@ class Linear:
         places: part of the room -> its number.
         weight_m2: sum of the beams' weights over their variances [1/m2]; without beams that of the
             tracked positions.
+        looked, beams: how many beams are looked at, and how many meet anything.
         whole: the linearisation that these are made of.
 
     Where nothing more is to be judged, `raw` and `whole` are None, and there are no clusters.
@@ -91,6 +92,8 @@ class Linear:
     places: dict[object, int]
     weight_m2: float
     whole: Linearisation | None
+    looked: int
+    beams: int
 
     def among(self, names: Sequence[str]) -> np.ndarray:
         """Columns of some unknowns among the S, in the order given."""
@@ -109,9 +112,14 @@ class Linear:
         )
 
 
+def _count(association: Association) -> int:
+    """How many beams meet anything."""
+    return int(np.count_nonzero(association.part >= 0))
+
+
 def beams_looked_at(associations: Sequence[Association]) -> int:
     """How many beams of each scan, at most, tell what is missing; of scans with fewer, all do."""
-    met = np.sort([np.count_nonzero(each.part >= 0) for each in associations])
+    met = np.sort([_count(each) for each in associations])
     before = np.concatenate([[0], np.cumsum(met)[:-1]])
     level = (LOOKED_BEAMS - before) // np.arange(len(met), 0, -1)  # if those before have fewer
     some = level[level < met]
@@ -140,22 +148,23 @@ def rows_along(
     if not wide.scans:
         return
     wide, values = beside(wide, estimate)
+    most, count = beams_looked_at(estimate.associations), away.shape[1]
+    wide, associations = _drawn(wide, estimate.associations, most)
     candidates = [name for name in wide.variables if name not in estimate.values]
     layout = Layout.of(wide, unbounded=candidates)
     beams = BeamsAlong(
         problem=wide,
         layout=layout,
         values=values,
-        associations=estimate.associations,
+        associations=associations,
         directions=np.concatenate([away[linear.columns[name]] for name in layout.at]),
         places=Gradients(layout.size, linear.places),
         progress=progress,
     )
-    most, count = beams_looked_at(estimate.associations), away.shape[1]
-    cells = np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
+    fewer, cells = None, np.count_nonzero((linear.stop >= 0) & (linear.place >= 0))
     if cells * count**2 > JUDGING_NUMBERS:
-        most = min(most, max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN))
-    yield from beams.rows(most)
+        fewer = max(DRAWN_NUMBERS // (count * len(wide.scans)), FEWEST_DRAWN)
+    yield from beams.rows(fewer)
 
 
 def beside(wide: Problem, estimate: Estimate) -> tuple[Problem, dict[str, np.ndarray]]:
@@ -224,6 +233,8 @@ def linearise_with(
         places=gradients.places,
         weight_m2=linear.weight_m2 or sum(len(b.measured) / b.sigma_m**2 for b in wide.bodies),
         whole=replace(linear, raw=None, layout=replace(layout, bodies=(), others=())),  # all here
+        looked=sum(map(_count, associations)),
+        beams=sum(map(_count, estimate.associations)),
     )
 
 

@@ -43,7 +43,7 @@ class Scores:
         cells: (C, Q) shares of the score, of rows of one stop and one place, by
             residuals as large as errors are (`leverage`).
         stop, place: (C,) the numbers of these, -1 for none.
-        weight_m2: of all beams, 1/m2.
+        weight_m2: of all beams that are looked at, 1/m2.
         spent: how many unknowns of the model differ by stop alone.
     """
 

@@ -45,7 +45,7 @@ SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
 # Beams of a scan at most that say between which shapes of a grid those of the next one are, and the
-# p-value with them above which all beams are not asked: choices. A name needs a p-value some
+# p-value with them above which no more beams are asked: choices. A name needs a p-value some
 # hundred times smaller, and what only 131,072 beams show is smaller than errors of a mesh.
 REFINING_BEAMS, TOO_LIKELY = 4_096, 0.05
 

@@ -14,7 +14,7 @@ from calib import outputs
 from calib.blunders import told
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
-from calib.diagnosis.linear import beams_looked_at
+from calib.diagnosis.linear import Linear
 from calib.diagnosis.rejects import Rejects, rejects
 from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
@@ -131,7 +131,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
             *hardly_checked(unseen),
             *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),
-            *_beams_drawn(stand),
+            *_beams_drawn(found.looks[0].linear),
             *run.omissions,
         ],
         command=_command(run, result),
@@ -256,14 +256,11 @@ def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
     return [stand.beams.sentence]
 
 
-def _beams_drawn(stand: Stand) -> list[str]:
+def _beams_drawn(linear: Linear) -> list[str]:
     """How many of the beams what is missing was looked for in, if not in all."""
-    associations = stand.estimate.associations
-    met = np.array([np.count_nonzero(each.part >= 0) for each in associations], int)
-    used = np.minimum(met, beams_looked_at(associations)).sum()
-    if used == met.sum():
+    if linear.looked == linear.beams:
         return []
-    share = f"{used:,} of {met.sum():,} beams"
+    share = f"{linear.looked:,} of {linear.beams:,} beams"
     return [f"What is missing was looked for in {share}, drawn evenly from every surface."]
 
 
