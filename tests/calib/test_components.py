@@ -182,9 +182,9 @@ def test_two_recordings_share_the_spread_and_nothing_else(scattered, tmp_path):
     ],
 )
 def test_rows_that_scatter_beyond_their_sigma_tell_by_how_much(worse, effect, size, keys):
-    """Bodies at 24 stops each, five targets; some 70 surfaces of the mesh: those furthest
-    off meet no beam that is believed. Of a joint all rows tell as much as 4 readings at least, where
-    its spread is the true one."""
+    """Bodies at 24 stops each, five targets; some 70 surfaces of the mesh, of which those furthest
+    off meet no beam that is believed. Of a joint all rows tell as much as 4 readings at least, if
+    it scatters as it truly does."""
     _, estimate = worse(effect, size)
     sigma = find(effect).sigma * size
     found = {key.partition(".")[2]: each for key, each in spreads(estimate).items()}
