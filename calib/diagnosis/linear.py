@@ -92,8 +92,8 @@ class Linear:
     places: dict[object, int]
     weight_m2: float
     whole: Linearisation | None
-    looked: int
-    beams: int
+    looked: int = 0
+    beams: int = 0
 
     def among(self, names: Sequence[str]) -> np.ndarray:
         """Columns of some unknowns among the S, in the order given."""
