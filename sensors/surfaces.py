@@ -142,7 +142,8 @@ class Ways:
         axes = np.concatenate([axes, np.cross(axes[:, 0], axes[:, 1])[:, None]], axis=1)[surface]
         along = np.einsum("fij,fj->fi", axes, normal)  # the last along the main direction
         cell = np.floor(np.einsum("fij,fj->fi", axes[:, :2], middle_m) / SMOOTHED_M)
-        along = _averages(along, area_m2, np.column_stack([surface, along[:, 2] > 0, cell]))
+        there = np.column_stack([surface, along[:, 2] > 0, cell]).astype(np.int64)
+        along = _averages(along, area_m2, there)
         spread = np.bincount(surface, area_m2 * np.square(along[:, :2]).sum(axis=1))
         curved = spread > np.sin(CURVED_RAD) ** 2 * np.bincount(surface, area_m2)
         way, count = np.zeros(len(surface), np.int64), np.ones(len(curved), np.int64)
@@ -189,9 +190,10 @@ class Ways:
 
 def _averages(normal: np.ndarray, area_m2: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Unit normals (F, 3), each that of all in its cell (F, k), by area."""
-    _, at = np.unique(cell, axis=0, return_inverse=True)
-    sums = np.stack([np.bincount(at.ravel(), area_m2 * each) for each in normal.T], axis=1)
-    return (sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None])[at.ravel()]
+    cell = cell - cell.min(axis=0)
+    _, at = np.unique(np.ravel_multi_index(cell.T, cell.max(axis=0) + 1), return_inverse=True)
+    sums = np.stack([np.bincount(at, area_m2 * each) for each in normal.T], axis=1)
+    return (sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-300)[:, None])[at]
 
 
 def _ways(normal: np.ndarray) -> np.ndarray:

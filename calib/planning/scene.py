@@ -171,7 +171,7 @@ class PlanningScene:
             real = estimate.scans[i].rows(self.values, estimate.associations[i])
             there = self.anew(i, patterns)
             planned = there.rows(self.values, there.associate(self.values, near_edges=True))
-            told, wanted = (float(np.sum(r.weight / np.square(r.sigma_m))) for r in (planned, real))
+            told, wanted = (float(np.sum(r.weight_m2)) for r in (planned, real))
             return wanted / max(told, 1e-300)
 
         return float(np.median(list(in_order(ratio, len(some)))))

@@ -135,7 +135,7 @@ def _told_of(values: Values, scan: ScanStop) -> np.ndarray:
     rows = scan.rows(values, None)
     T_world_lidar = scan.stops.in_world(scan.stops.rig.lidar_frame, values, False).T[0]
     by_shift = rows.by_twist[:, 3:] @ T_world_lidar[:3, :3].T
-    return by_shift.T @ ((rows.weight / rows.sigma_m**2)[:, None] * by_shift)
+    return by_shift.T @ (rows.weight_m2[:, None] * by_shift)
 
 
 def _rough_cost(values: Values, scan: ScanStop) -> float:
