@@ -223,7 +223,7 @@ class Reference:
             triangle: (N,) that was hit; -1 for none.
             point_m: (N, 3) where.
             size_m: about how wide a patch is.
-            by_way: whether patches of curved surfaces are divided by the way that they face.
+            by_way: whether patches of curved surfaces are divided by the way they face.
         """
         patch = np.full(len(triangle), -1, dtype=np.int64)
         hit = np.flatnonzero(triangle >= 0)

@@ -157,7 +157,7 @@ class Ways:
     def patch(
         self, whole: np.ndarray, triangle: np.ndarray, surface: np.ndarray, cells: np.ndarray
     ) -> np.ndarray:
-        """Patches (N,), those of curved surfaces divided by the way that they face. The parts are
+        """Patches (N,), those of curved surfaces divided by the way they face. The parts are
         counted after all patches that are whole.
 
         Args:
@@ -170,7 +170,7 @@ class Ways:
         return np.where(self.count[surface] > 1, parts + self.way[triangle], whole)
 
     def surfaces(self, cells: np.ndarray) -> np.ndarray:
-        """The surface (P,) of every patch, those that are apart included."""
+        """The surface (P,) of every patch, and then of every part of a divided one."""
         every = np.arange(len(cells))
         return np.concatenate([np.repeat(every, cells), np.repeat(every, self._apart(cells))])
 
