@@ -145,9 +145,9 @@ class MeshSurface:
         return self._patch(met, kind)
 
     def _patch(self, met: _Met, kind: str) -> np.ndarray:
-        """Patches (N,) of a kind. The finest are divided by the way they face: where a curved surface
-        stands elsewhere as a whole, its offset along the normal differs over it, and would be taken
-        for a shift of the whole mesh."""
+        """Patches (N,) of a kind. The finest are divided by the way they face: where a curved
+        surface stands elsewhere as a whole, its offset along the normal differs over it, and would
+        be taken for a shift of the whole mesh."""
         return self.reference.patch(met.part, met.point_m, self.patches_m[kind], kind == PATCH)
 
 
