@@ -26,9 +26,14 @@ def tukey_weight(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 def tukey_cost(z: np.ndarray, scale: float = 1.0) -> float:
     """Half the robust chi-square, ``sum rho(z)`` with ``rho''(0) = 1``."""
+    return float(np.sum(tukey_costs(z, scale)))
+
+
+def tukey_costs(z: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """What each row (N,) adds to that: ``rho(z)``."""
     c2 = (TUKEY * scale) ** 2
     inside = np.maximum(1.0 - np.square(z) / c2, 0.0)
-    return float(np.sum(c2 / 6.0 * (1.0 - inside**3)))
+    return c2 / 6.0 * (1.0 - inside**3)
 
 
 def robust_scale(z: np.ndarray) -> float:

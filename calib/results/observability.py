@@ -12,6 +12,7 @@ from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
+from calib.solve.added import felt
 from calib.solve.estimate import Estimate
 from calib.solve.otherwise.rooms import rooms_turned
 
@@ -23,6 +24,17 @@ SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # Of the leading parameter's share, in units of the priors, from which another is named beside it: a
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
+ROUNDED = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
+# Why a parameter that is tied to no other is not estimated.
+ALONE = (
+    "no measurement depends on it, so its estimate and sigma are those of rig.yaml",
+    "all beams that depend on it are rejected as too far off, so its estimate and sigma are those "
+    "of rig.yaml; what do these beams see?",
+    "rig.yaml states it more exactly than the data tell it, so its estimate and sigma are those of "
+    "rig.yaml",
+    "tied to the pose of the rig's root, which is unknown too: the data determine only their "
+    "combination; track a body on the root, or measure it directly",
+)
 
 
 def odd(estimate: Estimate) -> list[str]:
@@ -68,6 +80,7 @@ def not_estimated(
     covariance: np.ndarray,
     effects: frozenset[str],
     touched: np.ndarray,
+    rejected: np.ndarray,
 ) -> list[dict[str, str]]:
     """Parameters whose estimate is the prior's doing, and why.
 
@@ -79,26 +92,32 @@ def not_estimated(
         variables: those of the covariance, in order.
         covariance: (P, P) joint marginal.
         effects: names of those that are effects, not frames.
-        touched: (P,) whether any measurement depends on the parameter at all.
+        touched: (P,) whether any measurement that has weight depends on the parameter.
+        rejected: (P,) whether beams do, and none has weight.
 
     Returns:
         A `name` and a `why` for each.
     """
     names = [f"{v.name}.{dof}" for v in variables for dof in v.dofs]
     sigma = np.concatenate([v.sigma for v in variables])
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    unit = covariance / np.outer(sigma, sigma)
+    values, vectors = np.linalg.eigh(unit)
     untold = vectors[:, values > UNTOLD]
     if not untold.shape[1]:
         return []
     dims = [v.dim for v in variables]
     owner = np.repeat([v.name for v in variables], dims)
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
+    # What the data tell of each parameter where all others are held, over what its prior does.
+    told = np.diag(np.linalg.inv(unit)) - 1.0
+    alone = np.select([~touched & rejected, ~touched, told > ROUNDED], [1, 0, 2], 3)
     directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[int]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
         share = np.abs(column)
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
-        why = _why(touched[lead], _grouped(owner[partners], [names[i] for i in partners]))
+        tied_to = _grouped(owner[partners], [names[i] for i in partners])
+        why = _tied(tied_to) if tied_to else ALONE[int(alone[lead])]
         found.setdefault((str(owner[lead]), why), []).append(int(lead - first[lead]))
     whole = {v.name: v.dofs for v in variables}
     return [
@@ -147,15 +166,18 @@ def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
     return " and ".join(listed)
 
 
-def _why(touched: bool, partners: str) -> str:
-    if partners:
-        return (
-            f"tied to {partners}: the data determine only their combination, and how it is divided "
-            f"follows from the sigmas in rig.yaml; to separate them, measure one of them directly"
-        )
-    if touched:
-        return (
-            "tied to the pose of the rig's root, which is unknown too: the data determine only "
-            "their combination; track a body on the root, or measure it directly"
-        )
-    return "no measurement depends on it, so its estimate and sigma are those of rig.yaml"
+def all_rejected(estimate: Estimate) -> np.ndarray:
+    """Whether beams depend on each parameter of the calibration (P,), but none that has weight."""
+    touched = estimate.touched()
+    if np.all(touched) or not estimate.scans:
+        return np.zeros(len(touched), bool)
+    counts = felt(estimate.problem, estimate.values, estimate.associations)
+    usable = [counts.get(v.name, np.zeros((2, v.dim)))[0] for v in estimate.variables]
+    return (np.concatenate(usable) > 0) & ~touched
+
+
+def _tied(partners: str) -> str:
+    return (
+        f"tied to {partners}: the data determine only their combination, and how it is divided "
+        f"follows from the sigmas in rig.yaml; to separate them, measure one of them directly"
+    )

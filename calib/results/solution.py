@@ -18,7 +18,7 @@ from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
 from calib.results.intervals import Intervals
-from calib.results.observability import not_estimated
+from calib.results.observability import all_rejected, not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -160,7 +160,8 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         for t in terms
         if not isinstance(t.effect, FrameOffset)
     )
-    untold = not_estimated(estimate.variables, estimate.covariance, effects, estimate.touched())
+    measured = estimate.touched(), all_rejected(estimate)
+    untold = not_estimated(estimate.variables, estimate.covariance, effects, *measured)
     return Solution(
         shared=shared,
         recordings=recordings,

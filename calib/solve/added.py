@@ -1,8 +1,9 @@
-"""Where an effect that was added to a fit begins: not always at zero.
+"""Where unknowns begin of which only beams tell that have no weight.
 
-A beam beyond Tukey's 4.685 sigma has no weight, so an effect that explains such beams feels nothing
-of them at zero and would stay there. Huber's cost is convex: it has one minimum, which is found
-from anywhere. So what was added begins there, all else held, if Tukey's cost is lower than at zero.
+A beam beyond Tukey's 4.685 sigma has no weight, so an unknown that explains such beams feels
+nothing of them and would stay where it is: an effect that was added to a fit, or the offset of a
+ring all of whose beams are far off. Huber's cost is convex: it has one minimum, which is found from
+anywhere. So such an unknown begins there, all else held, if Tukey's cost is lower than where it is.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from calib.forward import Values
 from calib.linear.parallel import over_stops
 from calib.problem.problem import Problem
 from calib.residuals.beams import Association, Columns
+from calib.residuals.robust import tukey_costs
 from calib.residuals.scan import ScanStop
 
 HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Holland and Welsch 1977)
 MOST_PASSES = 5  # a choice: the cost is convex, and it is but where the fit begins
 SETTLED_SIGMAS = 0.1  # sigmas of an unknown: Tukey's steps do the rest
+MOST_REJECTED = 0.5  # of beams: robust scales hold where fewer are bad, so fewer than these may be
 
 
 def begun(
@@ -38,37 +41,96 @@ def begun(
         associations: per scan, what its beams meet.
         state: of the earlier fit; nothing is begun where there was none.
     """
-    scans = problem.scans
-    acting = {term.variable for scan in scans for term in scan.terms} - set(state)
+    if not state:
+        return {}
     known = problem.variables
-    names = [n for n in known if n in acting and np.array_equal(values[n], known[n].mean)]
-    if not state or not names:
+    new = [n for n in known if n not in state and np.array_equal(values[n], known[n].mean)]
+    return anew(problem, values, associations, {n: np.ones(known[n].dim, bool) for n in new})
+
+
+def rejected(
+    problem: Problem, values: Values, associations: Sequence[Association]
+) -> dict[str, np.ndarray]:
+    """The parameters that a part of the beams feel each, as rings do, and of whose beams most have
+    no weight.
+
+    Args:
+        problem, values, associations: as of `begun`.
+
+    Returns:
+        Unknown -> (P,) bool, of unknowns with any.
+    """
+    counts = felt(problem, values, associations)
+    most = {name: lost > MOST_REJECTED * usable for name, (usable, lost) in counts.items()}
+    return {name: some for name, some in most.items() if np.any(some)}
+
+
+def felt(
+    problem: Problem, values: Values, associations: Sequence[Association]
+) -> dict[str, np.ndarray]:
+    """Unknown -> (2, P) how many beams feel each parameter, of unknowns of which a beam feels one
+    parameter, as of rings; and how many of these have no weight.
+
+    Args:
+        problem, values, associations: as of `begun`.
+    """
+    acting = {term.variable for scan in problem.scans for term in scan.terms}
+    counts = {n: np.zeros((2, u.dim)) for n, u in problem.variables.items() if n in acting}
+    for found in over_stops(partial(_felt, values), problem.scans, associations):
+        for name in (n for n in found if n in counts):
+            counts[name] += found[name]
+    return counts
+
+
+def anew(
+    problem: Problem,
+    values: Values,
+    associations: Sequence[Association],
+    free: Mapping[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Where Huber's cost of the beams is least, all but some parameters held; of these, those for
+    which Tukey's cost is lower there than where they are.
+
+    Args:
+        problem, values, associations: as of `begun`.
+        free: unknown -> (P,) which of its parameters may move.
+
+    Returns:
+        Unknown -> (P,), of unknowns that moved.
+    """
+    scans, known = problem.scans, problem.variables
+    acting = {term.variable for scan in scans for term in scan.terms}
+    names = [n for n in known if n in acting and n in free and np.any(free[n])]
+    if not names:
         return {}
     sizes = [known[name].dim for name in names]
     at = dict(zip(names, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
     sigma = np.concatenate([known[name].sigma for name in names])
     mean = np.concatenate([known[name].mean for name in names])
+    moves = np.flatnonzero(np.concatenate([free[name] for name in names]))
 
-    def sums(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Normal equations of Huber's cost, priors included, and Tukey's cost."""
+    def sums(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Normal equations of Huber's cost, and Tukey's cost of the beams that feel each parameter;
+        priors included."""
         here = {**values, **{name: theta[i] for name, i in at.items()}}
         information, right = np.diag(1.0 / sigma**2), (mean - theta) / sigma**2
-        cost = float(np.sum(np.square((theta - mean) / sigma)) / 2)
-
+        cost = np.square((theta - mean) / sigma) / 2
         for gram, gradient, beams in over_stops(partial(_normal, here, at), scans, associations):
             information, right, cost = information + gram, right - gradient, cost + beams
         return information, right, cost
 
-    theta, first = np.concatenate([values[name] for name in names]), None
+    theta = before = np.concatenate([values[name] for name in names])
+    first = None
     for _ in range(MOST_PASSES):
         information, right, cost = sums(theta)
         first = cost if first is None else first
-        step = np.linalg.solve(information, right)
-        theta = theta + step
-        if np.all(np.abs(step) < SETTLED_SIGMAS / np.sqrt(np.diag(information))):
+        told = information[np.ix_(moves, moves)]
+        step = np.linalg.solve(told, right[moves])
+        theta = theta + np.bincount(moves, step, len(theta))
+        if np.all(np.abs(step) < SETTLED_SIGMAS / np.sqrt(np.diag(told))):
             break
-    lower = sums(theta)[2] < first
-    return {name: theta[i] for name, i in at.items()} if lower else {}
+    theta = np.where(sums(theta)[2] < first, theta, before)
+    return {name: theta[i] for name, i in at.items() if np.any(theta[i] != before[i])}
 
 
 def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
@@ -81,8 +143,9 @@ def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
 
 def _normal(
     values: Values, at: Mapping[str, np.ndarray], scan: ScanStop, association: Association
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """One stop's weighted Gram matrix and gradient of some unknowns, and its cost after Tukey."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One stop's weighted Gram matrix and gradient of some unknowns, and Tukey's cost of the beams
+    that feel each of their parameters."""
     rows = scan.rows(values, association)
     count, parts = len(rows.residual_m), []
     for name, i in at.items():
@@ -90,10 +153,24 @@ def _normal(
         sparse = [_sparse(c, count, len(i)) for c in rows.sparse if c.variable == name]
         parts.append(sum(sparse, csr_array(dense)))
     A = hstack(parts, format="csr")
-    z = rows.residual_m / rows.sigma_m
+    z = np.where(rows.usable, rows.residual_m / rows.sigma_m, 0.0)
     huber = np.minimum(1.0, HUBER * rows.scale / np.maximum(np.abs(z), 1e-300))
     weighted = A.multiply((np.where(rows.usable, huber, 0.0) / rows.sigma_m**2)[:, None]).T.tocsr()
-    return (weighted @ A).toarray(), weighted @ rows.residual_m, rows.cost
+    cost = (A != 0).T.astype(float) @ tukey_costs(z, rows.scale)
+    return (weighted @ A).toarray(), weighted @ rows.residual_m, cost
+
+
+def _felt(values: Values, scan: ScanStop, association: Association) -> dict[str, np.ndarray]:
+    """The same of one stop."""
+    rows, out = scan.rows(values, association), {}
+    lost = rows.usable & (rows.weight == 0.0)
+    for column in rows.sparse:
+        counts = np.zeros((2, column.components.max(initial=-1) + 1))
+        for n, some in enumerate((rows.usable, lost)):
+            known = column.index[some & (column.index >= 0)]
+            counts[n] += np.bincount(column.components[known], minlength=counts.shape[1])
+        out[column.variable] = counts
+    return out
 
 
 def _sparse(column: Columns, rows: int, size: int) -> csr_array:

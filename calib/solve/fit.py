@@ -67,6 +67,7 @@ def solve(
         loop.doubt_bodies()
     if loop.start.state and problem.scans:
         _go_on(loop, tolerance)
+        _hear_rejected(loop, tolerance)
         return _not_raised(loop, loop.estimate(tolerance if spread else None))
     _without_scans(loop, problem, turns=prior is None)
     if problem.scans:
@@ -79,6 +80,7 @@ def solve(
         if spread:
             loop.begin_spread()
         _arrive(loop, tolerance)
+        _hear_rejected(loop, tolerance)
     elif loop.start.state:
         _stay_below(loop, lambda: loop.descend(STEADY, beams=False))
     return _not_raised(loop, loop.estimate(tolerance if spread else None))
@@ -134,6 +136,12 @@ def _go_on(loop: Loop, tolerance: float) -> None:
     loop.reweigh(beams=True)
     loop.settle_on(tolerance)
     _stay_below(loop, lambda: loop.descend(LAST, tolerance))
+
+
+def _hear_rejected(loop: Loop, tolerance: float) -> None:
+    """Begin anew with parameters most of whose beams are rejected, where the cost is lower then."""
+    if not loop.lost and loop.begin_rejected():
+        loop.settle_on(tolerance)
 
 
 def _stay_below(loop: Loop, descend: Callable[[], bool]) -> None:

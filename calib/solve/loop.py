@@ -22,7 +22,7 @@ from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
-from calib.solve.added import begun
+from calib.solve.added import anew, begun, rejected
 from calib.solve.components import squares, wider
 from calib.solve.components.told import sds, told
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progress
@@ -311,6 +311,18 @@ class Loop(Descent):
         if not self.passes:  # later, the fit itself knows better
             self.values |= begun(self.problem, self.values, self.associations, self.start.state)
         self.lay_out()
+
+    def begin_rejected(self) -> bool:
+        """Take parameters most of whose beams have no weight to where these would have them, if the
+        cost is lower there; whether any moved."""
+
+        def compute() -> Answer:
+            here = self.problem, self.values, self.associations
+            return anew(*here, rejected(*here))
+
+        moved = self.journal.answer({**self.values, "": "rejected"}, compute)
+        self.values = {**self.values, **moved}
+        return bool(moved)
 
     def _cells(self) -> dict[str, np.ndarray]:
         """The present state of the surfaces' unknowns, of those that there are."""

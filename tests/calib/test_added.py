@@ -1,10 +1,12 @@
-"""Where an effect begins that is added to a fit which rejects all that it explains."""
+"""Where unknowns begin where a fit rejects all that they explain."""
 
+import numpy as np
 import pytest
 
 from calib.effects.own.formula import FormulaEffect
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.results.observability import all_rejected
 from calib.simulation import Spec
 from calib.solve.fit import solve
 from sensors.documents import Marks
@@ -44,3 +46,48 @@ def test_an_effect_that_explains_nothing_begins_at_zero(tmp_path):
     without = solve(build([source], Model()))
     found = solve(build([source], Model().plus((sector(),))), start=without.start)
     assert abs(found.values["sector"][0]) < 1e-3
+
+
+def rings_of(source: Source) -> tuple[np.ndarray, np.ndarray]:
+    """Elevation of each ring, rad, and how far from it a beam of its own lies at most."""
+    elevation = np.asarray(source.rig.lidar.elevation_rad)
+    return elevation, np.min(np.abs(np.diff(np.sort(elevation)))) / 2
+
+
+def with_ring_off(source: Source, ring: int, off: rescans.Change) -> Source:
+    """The recording with the ranges of a ring longer by `off`."""
+    elevation, half = rings_of(source)
+
+    def change(stop, range_m, azimuth, elevations):
+        mine = np.abs(elevations - elevation[ring]) < half
+        return range_m + np.where(mine, off(stop, range_m, azimuth, elevations), 0.0)
+
+    change_ranges(source.recording.folder, change)
+    return Source.open(source.recording.folder)
+
+
+def test_a_ring_all_of_whose_beams_are_far_off_is_found(tmp_path):
+    """By 0.3 m: one or two stray beams hold it where it is, with a sigma of some mm."""
+    source, truth = made(tmp_path / "rec", SMALL)
+    source = with_ring_off(source, 12, lambda stop, range_m, *_: np.full(len(range_m), -0.3))
+    found = solve(build([source], Model()))
+    assert found.converged
+    offset = found.values["ring_range_offset"]
+    true = np.array(truth["effects"]["ring_range_offset"]) - 0.3 * (np.arange(len(offset)) == 12)
+    assert np.abs(offset - offset.mean() - true + true.mean()).max() < 3e-3
+
+
+def test_a_ring_whose_beams_fit_nothing_stays_and_it_is_said_why(tmp_path):
+    """No two of its beams are off by the same, and none by less than ten of its sigmas."""
+    source = made(tmp_path / "rec", SMALL)[0]
+
+    def apart(stop, range_m, azimuth, elevation):
+        return -0.5 - (azimuth / np.pi + 1.0) / 2 - 0.05 * stop / 6
+
+    source = with_ring_off(source, 12, apart)
+    found = solve(build([source], Model()))
+    names = [f"{v.name}.{dof}" for v in found.variables for dof in v.dofs]
+    assert [n for n, it in zip(names, all_rejected(found), strict=True) if it] == [
+        "ring_range_offset.ring_012"
+    ]
+    assert abs(found.values["ring_range_offset"][12]) < 1e-9
