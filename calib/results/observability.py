@@ -24,9 +24,9 @@ SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # Of the leading parameter's share, in units of the priors, from which another is named beside it: a
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
-ROUNDED = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
+ROUNDING_OF_PRIOR = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
 # Why a parameter that is tied to no other is not estimated.
-ALONE = (
+UNTIED = (
     "no measurement depends on it, so its estimate and sigma are those of rig.yaml",
     "all beams that depend on it are rejected as too far off, so its estimate and sigma are those "
     "of rig.yaml; what do these beams see?",
@@ -110,14 +110,14 @@ def not_estimated(
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
     # What the data tell of each parameter where all others are held, over what its prior does.
     told = np.diag(np.linalg.inv(unit)) - 1.0
-    alone = np.select([~touched & rejected, ~touched, told > ROUNDED], [1, 0, 2], 3)
+    alone = np.select([~touched & rejected, ~touched, told > ROUNDING_OF_PRIOR], [1, 0, 2], 3)
     directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[int]] = {}
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
         share = np.abs(column)
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
         tied_to = _grouped(owner[partners], [names[i] for i in partners])
-        why = _tied(tied_to) if tied_to else ALONE[int(alone[lead])]
+        why = _tied(tied_to) if tied_to else UNTIED[int(alone[lead])]
         found.setdefault((str(owner[lead]), why), []).append(int(lead - first[lead]))
     whole = {v.name: v.dofs for v in variables}
     return [
