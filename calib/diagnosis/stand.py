@@ -13,7 +13,7 @@ import numpy as np
 from calib import problem as problems
 from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
-from calib.blunders.slivers import slivers
+from calib.blunders.unjudged import unjudged
 from calib.diagnosis.candidates import finer, known_effects
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.chance.agreeing import agreements
@@ -285,10 +285,10 @@ class Look:
     @cached_property
     def blunders(self) -> list[Blunder]:
         """All groups of rows, those that chance explains least first; of parts of the mesh that
-        would be named, no `slivers`."""
+        would be named, none that is `unjudged`."""
         judged = judge(self.others)
         parts = [b.group for b in judged if b.found and b.group.kind == "surface"]
-        gone = slivers(self.stand.estimate, parts)
+        gone = unjudged(self.stand.estimate, parts)
         return [b for b in judged if b.group not in gone]
 
     @cached_property

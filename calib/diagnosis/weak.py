@@ -124,8 +124,6 @@ def hardly_known(
 
 def _of_space(space: np.ndarray) -> np.ndarray:
     """Directions (r, P) of unit length that span a space (P, r)."""
-    if not space.shape[1]:
-        return space.T
     directions = echelon(space, np.ones(len(space)))[0].T
     return directions / np.linalg.norm(directions, axis=1)[:, None]
 

@@ -21,6 +21,9 @@ Where stops err together 0.92 to 0.95 of 95 % intervals hold, with 4 to 30 stops
 parameters that differ by stop (the worlds of `tests/calib/test_intervals.py`, 600 draws each);
 where rows err alone, 0.97 to 0.99.
 
+Of a ring most of whose beams are rejected the others may agree by chance: its interval is that of
+its prior.
+
 Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
 
@@ -40,6 +43,7 @@ from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Role
+from calib.results.observability import not_trusted
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -222,7 +226,10 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     )
     every = np.arange(directions.shape[1])
     sums.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
-    known = layout.outer()
+    known, wider = layout.outer(), sums.wider()
+    for name, lost in not_trusted(estimate).items():
+        at = np.searchsorted(layout.kept, layout.columns([name])[lost])
+        wider[at] = np.maximum(wider[at], known[name].sigma[lost] / sigma[at])
     return Intervals(
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),
@@ -230,7 +237,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         data=estimate.kept - sums.priors * np.outer(sigma, sigma),
         paper=paper * np.outer(sigma, sigma),
         given=given * np.outer(sigma, sigma),
-        wider=sums.wider(),
+        wider=wider,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.linalg import qr
@@ -12,7 +12,7 @@ from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
-from calib.solve.added import felt
+from calib.solve.added import NOT_TO_BE_TRUSTED, rejected
 from calib.solve.estimate import Estimate
 from calib.solve.otherwise.rooms import rooms_turned
 
@@ -25,15 +25,19 @@ SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
 ROUNDING_OF_PRIOR = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
-# Why a parameter that is tied to no other is not estimated.
-UNTIED = (
-    "no measurement depends on it, so its estimate and sigma are those of rig.yaml",
-    "all beams that depend on it are rejected as too far off, so its estimate and sigma are those "
-    "of rig.yaml; what do these beams see?",
+# Why a parameter is not estimated that is tied to no other.
+UNMEASURED = "no measurement depends on it, so its estimate and sigma are those from before the fit"
+REJECTED_BEAMS = (
+    "most or all of the beams that depend on it are rejected, and the others may agree by chance, "
+    "so its sigma is that from before the fit; what do these beams see?"
+)
+TOLD_BEFORE = (
     "rig.yaml states it more exactly than the data tell it, so its estimate and sigma are those of "
-    "rig.yaml",
+    "rig.yaml"
+)
+TIED_TO_ROOT = (
     "tied to the pose of the rig's root, which is unknown too: the data determine only their "
-    "combination; track a body on the root, or measure it directly",
+    "combination; track a body on the root, or measure it directly"
 )
 
 
@@ -80,7 +84,7 @@ def not_estimated(
     covariance: np.ndarray,
     effects: frozenset[str],
     touched: np.ndarray,
-    rejected: np.ndarray,
+    lost: Mapping[str, np.ndarray],
 ) -> list[dict[str, str]]:
     """Parameters whose estimate is the prior's doing, and why.
 
@@ -93,7 +97,7 @@ def not_estimated(
         covariance: (P, P) joint marginal.
         effects: names of those that are effects, not frames.
         touched: (P,) whether any measurement that has weight depends on the parameter.
-        rejected: (P,) whether beams do, and none has weight.
+        lost: unknown -> (n,) which of its parameters are `not_trusted`.
 
     Returns:
         A `name` and a `why` for each.
@@ -103,21 +107,26 @@ def not_estimated(
     unit = covariance / np.outer(sigma, sigma)
     values, vectors = np.linalg.eigh(unit)
     untold = vectors[:, values > UNTOLD]
-    if not untold.shape[1]:
-        return []
+    of_rejected = np.concatenate([lost.get(v.name, np.zeros(v.dim, bool)) for v in variables])
     dims = [v.dim for v in variables]
     owner = np.repeat([v.name for v in variables], dims)
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
     # What the data tell of each parameter where all others are held, over what its prior does.
     told = np.diag(np.linalg.inv(unit)) - 1.0
-    alone = np.select([~touched & rejected, ~touched, told > ROUNDING_OF_PRIOR], [1, 0, 2], 3)
+    reasons = np.select(
+        [~touched, told > ROUNDING_OF_PRIOR], [UNMEASURED, TOLD_BEFORE], TIED_TO_ROOT
+    )
     directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[int]] = {}
+    for i in np.flatnonzero(of_rejected):
+        found.setdefault((str(owner[i]), REJECTED_BEAMS), []).append(int(i - first[i]))
     for column, lead in sorted(zip(directions.T, leading, strict=True), key=lambda pair: pair[1]):
+        if of_rejected[lead]:
+            continue
         share = np.abs(column)
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
         tied_to = _grouped(owner[partners], [names[i] for i in partners])
-        why = _tied(tied_to) if tied_to else UNTIED[int(alone[lead])]
+        why = _tied(tied_to) if tied_to else str(reasons[lead])
         found.setdefault((str(owner[lead]), why), []).append(int(lead - first[lead]))
     whole = {v.name: v.dofs for v in variables}
     return [
@@ -135,6 +144,8 @@ def echelon(space: np.ndarray, preference: np.ndarray) -> tuple[np.ndarray, np.n
         space: orthonormal directions.
         preference: (P,) for a parameter to lead.
     """
+    if not space.shape[1]:
+        return space, np.zeros(0, int)
     _, _, order = qr((space * preference[:, None]).T, mode="economic", pivoting=True)
     leading = order[: space.shape[1]]
     return space @ np.linalg.inv(space[leading]), leading
@@ -166,14 +177,11 @@ def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
     return " and ".join(listed)
 
 
-def all_rejected(estimate: Estimate) -> np.ndarray:
-    """Whether beams depend on each parameter of the calibration (P,), but none that has weight."""
-    touched = estimate.touched()
-    if np.all(touched) or not estimate.scans:
-        return np.zeros(len(touched), bool)
-    counts = felt(estimate.problem, estimate.values, estimate.associations)
-    usable = [counts.get(v.name, np.zeros((2, v.dim)))[0] for v in estimate.variables]
-    return (np.concatenate(usable) > 0) & ~touched
+def not_trusted(estimate: Estimate) -> dict[str, np.ndarray]:
+    """Unknown of the calibration -> which of its parameters (P,) hang on beams most of which are
+    rejected; of unknowns with any."""
+    found = rejected(estimate.problem, estimate.values, estimate.associations, NOT_TO_BE_TRUSTED)
+    return {v.name: found[v.name] for v in estimate.variables if v.name in found}
 
 
 def _tied(partners: str) -> str:

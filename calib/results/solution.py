@@ -18,7 +18,7 @@ from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
 from calib.results.intervals import Intervals
-from calib.results.observability import all_rejected, not_estimated
+from calib.results.observability import not_estimated, not_trusted
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -160,7 +160,7 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         for t in terms
         if not isinstance(t.effect, FrameOffset)
     )
-    measured = estimate.touched(), all_rejected(estimate)
+    measured = estimate.touched(), not_trusted(estimate)
     untold = not_estimated(estimate.variables, estimate.covariance, effects, *measured)
     return Solution(
         shared=shared,

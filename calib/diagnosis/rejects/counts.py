@@ -101,7 +101,7 @@ class CellAxis:
     @property
     def count(self) -> int:
         """How many bins."""
-        return int(self.bins[-1]) + 1
+        return int(self.bins.max(initial=-1)) + 1
 
     @cached_property
     def bin_of(self) -> np.ndarray:
@@ -352,7 +352,7 @@ def _count_stop(
 def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct whole numbers from -1 up, and which of these each value is; they are few."""
     found = np.flatnonzero(np.bincount(values + 1))
-    number = np.zeros(found[-1] + 1, int)
+    number = np.zeros(values.max(initial=-1) + 2, int)
     number[found] = np.arange(len(found))
     return found - 1, number[values + 1]
 

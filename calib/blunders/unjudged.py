@@ -1,7 +1,8 @@
-"""Narrow parts of a mesh most of whose beams a fit rejects: the few left do not say where it is.
+"""Parts of a mesh of which it cannot be judged whether they are where the mesh has them.
 
 Beams that pass the edge of a narrow part by a millimetre meet it by what the mesh says, and
 something else in the room. Where these are more than half, the others are no sample of the part.
+And a part that most of all beams meet is what all else is held against: nothing contradicts it.
 """
 
 from __future__ import annotations
@@ -22,39 +23,50 @@ KEPT_BEAMS = 0.5  # of those that meet a part: with fewer, their median is of so
 # Beams of a scan that meet a part, on average of those that do: with fewer, none has others on both
 # sides, and all may be at its edges.
 INSIDE_BEAMS = 3.0
+MOST_BEAMS = 0.5  # of all: what the minority of the rows says, no more can be a mishap
 Numbers = Mapping[str, np.ndarray]
 """Kind of part -> the numbers (n,) of some parts, ascending."""
 
 
-def slivers(estimate: Estimate, parts: Collection[Group]) -> set[Group]:
-    """Those of some parts of the mesh that are narrow, and of whose beams a fit rejects most."""
+def unjudged(estimate: Estimate, parts: Collection[Group]) -> set[Group]:
+    """Those of some parts of the mesh that are narrow, and of whose beams a fit rejects most; and
+    those that most of all beams meet."""
     if not parts:
         return set()
     groups = {kind_and_number(group.what): group for group in parts}
     kinds = {kind for kind, _ in groups}
     numbers = {kind: np.array(sorted(n for k, n in groups if k == kind)) for kind in kinds}
     work = partial(_counted, estimate.values, numbers)
-    counts = {kind: np.zeros((3, len(some)), int) for kind, some in numbers.items()}
+    counts = {kind: np.zeros((4, len(some)), int) for kind, some in numbers.items()}
     for found in over_stops(work, estimate.scans, estimate.associations):
         for kind, count in found.items():
             counts[kind] += count
     return {
         groups[kind, number]
         for kind, some in numbers.items()
-        for number, (scans, met, kept) in zip(some.tolist(), counts[kind].T.tolist(), strict=True)
-        if kept < KEPT_BEAMS * met and met < INSIDE_BEAMS * scans
+        for number, each in zip(some.tolist(), counts[kind].T.tolist(), strict=True)
+        if _narrow(*each) or _of_most(*each)
     }
+
+
+def _narrow(scans: int, every: int, met: int, kept: int) -> bool:
+    return kept < KEPT_BEAMS * met and met < INSIDE_BEAMS * scans
+
+
+def _of_most(scans: int, every: int, met: int, kept: int) -> bool:
+    return met > MOST_BEAMS * every
 
 
 def _counted(
     values: Mapping[str, np.ndarray], numbers: Numbers, scan: ScanStop, association: Association
 ) -> dict[str, np.ndarray]:
-    """Of each part (3, n), whether any beam of a scan meets it, how many do, and how many of these
-    have any weight."""
+    """Of each part (4, n), whether any beam of a scan meets it, how many beams the scan has, how
+    many of them meet it, and how many of these have any weight."""
     rows, counts = scan.rows(values, association), {}
     for kind, some in numbers.items():
         at = place_of(scan.parts(association, kind), some)
         beams = (at[which & (at >= 0)] for which in (rows.usable, rows.weight > 0))
         met, kept = (np.bincount(each, minlength=len(some)) for each in beams)
-        counts[kind] = np.stack([met > 0, met, kept])
+        every = np.full(len(some), np.count_nonzero(rows.usable))
+        counts[kind] = np.stack([met > 0, every, met, kept])
     return counts
