@@ -12,7 +12,7 @@ from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
-from calib.solve.added import NOT_TO_BE_TRUSTED, rejected
+from calib.solve.added import rejected
 from calib.solve.estimate import Estimate
 from calib.solve.otherwise.rooms import rooms_turned
 
@@ -28,7 +28,7 @@ ROUNDING_OF_PRIOR = 1e-9  # of a prior: what is less is rounding, in a covarianc
 # Why a parameter is not estimated that is tied to no other.
 UNMEASURED = "no measurement depends on it, so its estimate and sigma are those from before the fit"
 REJECTED_BEAMS = (
-    "most or all of the beams that depend on it are rejected, and the others may agree by chance, "
+    "half or more of the beams that depend on it are rejected; the others may agree by chance, "
     "so its sigma is that from before the fit; what do these beams see?"
 )
 TOLD_BEFORE = (
@@ -180,7 +180,7 @@ def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
 def not_trusted(estimate: Estimate) -> dict[str, np.ndarray]:
     """Unknown of the calibration -> which of its parameters (P,) hang on beams most of which are
     rejected; of unknowns with any."""
-    found = rejected(estimate.problem, estimate.values, estimate.associations, NOT_TO_BE_TRUSTED)
+    found = rejected(estimate.problem, estimate.values, estimate.associations)
     return {v.name: found[v.name] for v in estimate.variables if v.name in found}
 
 

@@ -24,11 +24,11 @@ from calib.residuals.scan import ScanStop
 HUBER = 1.345  # sigmas: 95 % efficiency on normal rows (Holland and Welsch 1977)
 MOST_PASSES = 5  # a choice: the cost is convex, and it is but where the fit begins
 SETTLED_SIGMAS = 0.1  # sigmas of an unknown: Tukey's steps do the rest
-MOST_REJECTED = 0.5  # of beams: robust scales hold where fewer are bad, so fewer than these may be
-# Of the beams of a ring, from which on what is left of them may agree by chance. Of rings that meet
-# clutter, spread over a tenth of the range or more, 88 to 97 % were rejected, and the rest held
-# offsets 5 to 45 sigmas off; where people stood before 40 % of the walls, 39 to 46 % of any ring's.
-NOT_TO_BE_TRUSTED = 2 / 3
+# Of the beams of a ring, from which on those that are left may agree by chance: where half of the
+# rows are bad, no estimate is robust. Of rings that meet clutter, spread over a tenth of the range
+# or more, 88 to 97 % were rejected, and the rest held offsets 5 to 45 sigmas off; where people
+# stood before 40 % of the walls, 39 to 46 % of any ring's.
+MOST_REJECTED = 0.5
 
 
 def begun(
@@ -53,17 +53,13 @@ def begun(
 
 
 def rejected(
-    problem: Problem,
-    values: Values,
-    associations: Sequence[Association],
-    share: float = MOST_REJECTED,
+    problem: Problem, values: Values, associations: Sequence[Association]
 ) -> dict[str, np.ndarray]:
-    """The parameters that a part of the beams feel each, as rings do, and of whose beams more than
-    a share have no weight.
+    """The parameters that a part of the beams feel each, as rings do, and of whose beams half or
+    more have no weight.
 
     Args:
         problem, values, associations: as of `begun`.
-        share: of the beams.
 
     Returns:
         Unknown -> (P,) bool, of unknowns with any.
@@ -73,7 +69,9 @@ def rejected(
     for found in over_stops(partial(_felt, values), problem.scans, associations):
         for name in (n for n in found if n in counts):
             counts[name] += found[name]
-    most = {name: lost > share * usable for name, (usable, lost) in counts.items()}
+    most = {
+        n: (lost > 0) & (lost >= MOST_REJECTED * usable) for n, (usable, lost) in counts.items()
+    }
     return {name: some for name, some in most.items() if np.any(some)}
 
 

@@ -54,8 +54,8 @@ def test_names_are_not_cut_at_their_points_and_are_read_back(untold, names):
     ("left", "touched", "rejected", "why"),
     [
         (1.0, False, False, "no measurement depends on it"),
-        (1.0, False, True, "most or all of the beams that depend on it are rejected"),
-        (0.1, True, True, "most or all of the beams that depend on it are rejected"),
+        (1.0, False, True, "half or more of the beams that depend on it are rejected"),
+        (0.1, True, True, "half or more of the beams that depend on it are rejected"),
         (1.0 - 1e-4, True, False, "rig.yaml states it more exactly than the data tell it"),
         (1.0, True, False, "tied to the pose of the rig's root"),
     ],
