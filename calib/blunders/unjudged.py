@@ -23,7 +23,7 @@ KEPT_BEAMS = 0.5  # of those that meet a part: with fewer, their median is of so
 # Beams of a scan that meet a part, on average of those that do: with fewer, none has others on both
 # sides, and all may be at its edges.
 INSIDE_BEAMS = 3.0
-MOST_BEAMS = 0.5  # of all: what the minority of the rows says, no more can be a mishap
+MOST_OF_ALL = 0.5  # of all: what the minority of the rows says, no more can be a mishap
 Numbers = Mapping[str, np.ndarray]
 """Kind of part -> the numbers (n,) of some parts, ascending."""
 
@@ -54,7 +54,7 @@ def _narrow(scans: int, every: int, met: int, kept: int) -> bool:
 
 
 def _of_most(scans: int, every: int, met: int, kept: int) -> bool:
-    return met > MOST_BEAMS * every
+    return met > MOST_OF_ALL * every
 
 
 def _counted(

@@ -234,3 +234,24 @@ def test_p_values_hold_their_level_where_beams_of_one_place_err_together():
         small.append(_p_values(view, np.ones(len(at), bool)))
     assert (np.array(small) < 0.05).mean() < 0.05
     assert (np.array(small) < 0.001).mean() < 0.001
+
+
+def strewn(both_ways: bool) -> Change:
+    """Of all beams 8 % end anywhere on the second half of their way; or as far behind their end."""
+    rng = np.random.default_rng(4)
+
+    def change(stop, range_m, azimuth, elevation):
+        off = 0.05 + 0.45 * rng.random(len(range_m))
+        sign = np.where(both_ways & (rng.random(len(range_m)) < 0.5), -1.0, 1.0)
+        return np.where(rng.random(len(range_m)) < 0.08, range_m * (1.0 - sign * off), range_m)
+
+    return change
+
+
+def test_things_everywhere_that_the_mesh_lacks_are_clutter(studied):
+    """They stand before the mesh, which mixed pixels and errors of the LiDAR do not alone."""
+    found, _ = studied("strewn", strewn(both_ways=False))
+    assert found.explained and found.clutter > 0.05
+    assert found.share > 0.07 and found.expected == pytest.approx(found.share)
+    found, _ = studied("both ways", strewn(both_ways=True))
+    assert found.beyond and not found.explained

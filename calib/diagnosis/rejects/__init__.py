@@ -76,7 +76,10 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     outside = 1.0 - sum(place.beams for place in apart)
     usual = float((~elsewhere).sum()) / total - sum(place.rejected for place in apart)
     others = counts.rejected[~_any(counts, said) & ~elsewhere]
+    less = others[~crowded[others.stop, others.surface]]
     beyond = len(others) / total - hit > CLUTTER
+    if beyond and less.in_the_way:  # too few on each surface for scans of few beams to say so
+        hit, beyond = hit + len(less) / total, False
     return Rejects(
         share=len(counts.rejected) / total,
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
@@ -271,7 +274,7 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
         residual_m=float(np.median(steady.residual_m)),
         sigma_m=steady.sigma_m,
         coherent=rejected.coherent or bool(parts and share > WHOLE_SHARE and steady.coherent),
-        short=float(np.mean(rejected.residual_m < 0)),
+        short=rejected.short,
         along=along,
     )
 

@@ -24,6 +24,9 @@ CELLS, REJECT_BINS = 240, 12  # of a covariate: where an interval may end, and w
 # Share of rejected beams that agree on a size, beyond those that agree with its negative, from
 # which they are coherent: a choice, most of them.
 AGREES = 0.5
+# Share of rejected beams that end before the mesh, from which something stands in their way: a
+# choice. Of rooms of which the mesh lacks the furniture it is all, of people before walls 0.95.
+MOSTLY_SHORT = 0.9
 
 
 @dataclass(frozen=True)
@@ -170,6 +173,16 @@ class Rejected:
         other sign: an error of one size, where mixed pixels and clutter scatter over all values."""
         agrees, mirrored = (np.abs(self.residual_m - m) < self.reach_m for m in self._medians)
         return len(self) > 0 and bool(agrees.mean() - mirrored.mean() > AGREES)
+
+    @property
+    def short(self) -> float:
+        """Which share of them ends before the mesh; 0 of none."""
+        return float(np.mean(self.residual_m < 0)) if len(self) else 0.0
+
+    @property
+    def in_the_way(self) -> bool:
+        """Whether they hit something nearer than the mesh, at all distances."""
+        return self.short > MOSTLY_SHORT and not self.coherent
 
     @property
     def agreeing(self) -> Rejected:

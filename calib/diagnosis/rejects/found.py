@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.blunders import told
+from calib.diagnosis.rejects.counts import MOSTLY_SHORT
 from calib.diagnosis.rejects.moved import MOST_NAMED, MovedPart
 from calib.diagnosis.suggest import words
 from calib.problem.model import Source
@@ -83,7 +84,7 @@ class Place:
     @property
     def in_the_way(self) -> bool:
         """Whether its beams hit something nearer than the mesh, at all distances."""
-        return not self.coherent and self.short > 0.9
+        return not self.coherent and self.short > MOSTLY_SHORT
 
     @property
     def where(self) -> str:
