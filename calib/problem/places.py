@@ -141,7 +141,9 @@ class Places:
         """T_world_root: unknown but for the room, or guessed, or, where nothing says, given."""
         source = self.part.source
         tracked = start.root_pose(source, stops)
-        guess = start.guessed_pose(source, stops)
+        place = standing(source)
+        there = np.flatnonzero(place == place[stops[0]])  # a guess at one of them is of all
+        guess = start.guessed_pose(source, there)
         if guess is not None and self.reference:
             guess = self.problem.initial[self.reference] @ guess
         sigma = UNKNOWN_POSE
@@ -160,7 +162,7 @@ class Places:
                     f"{source.recording.folder / 'stops.csv'}: '{stop}': nothing tracks the rig"
                     f" and there is no base_guess to start from; add base_guess.x … base_guess.qz"
                 )
-        owner = Owner(recording=self.part.label, where=str(standing(source)[stops[0]]))
+        owner = Owner(recording=self.part.label, where=str(place[stops[0]]))
         self.problem.add(pose_unknown(name, T, sigma, Role.PLACE, owner))
 
     def _neighbour(self, stops: np.ndarray) -> np.ndarray | None:

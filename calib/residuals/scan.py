@@ -280,8 +280,7 @@ class ScanStop:
         if not (found.part >= 0).any():
             raise NothingMetError(
                 f"{self.recording.folder}: stop '{self.name}': none of its {len(found.part)} beams "
-                f"meets a surface; check the scan's units, the mesh's frame, and where the stop "
-                f"starts (base_guess, targets)"
+                f"{self.meeting.not_met}; or leave out {self.group.token}"
             )
         return found
 

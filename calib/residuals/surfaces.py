@@ -37,7 +37,13 @@ ROOM_M2 = 200.0
 
 
 class Meeting(Protocol):
-    """Something that beams meet. First associate, then meet: an association can be kept."""
+    """Something that beams meet. First associate, then meet: an association can be kept.
+
+    Args:
+        not_met: what is wrong where no beam of a scan meets it; the end of a sentence.
+    """
+
+    not_met: str
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
@@ -66,6 +72,11 @@ class MeshSurface:
     reference: Reference
     footprint_rad: float
     without: Mapping[str, Collection[int]] = field(default_factory=dict)
+    not_met: str = field(
+        default="meets a surface of the mesh; check the scan's units, the mesh's frame, and where "
+        "the stop starts (base_guess, targets)",
+        init=False,
+    )
 
     @cached_property
     def patches_m(self) -> dict[str, float]:
@@ -167,6 +178,11 @@ class PlaneSurface:
 
     planes: Planes
     variable: str
+    not_met: str = field(
+        default="meets a plane, and planes are what was found in the scans, as there is no mesh; "
+        "check where the stop starts (base_guess)",
+        init=False,
+    )
 
     @cached_property
     def axes(self) -> np.ndarray:

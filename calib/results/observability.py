@@ -25,6 +25,7 @@ SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
 ROUNDING_OF_PRIOR = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
+BEYOND_GUESSES = 10.0  # times what the priors of the root's poses tell: a choice, clearly more
 # Why a parameter is not estimated that is tied to no other.
 UNMEASURED = "no measurement depends on it, so its estimate and sigma are those from before the fit"
 REJECTED_BEAMS = (
@@ -85,6 +86,7 @@ def not_estimated(
     effects: frozenset[str],
     touched: np.ndarray,
     lost: Mapping[str, np.ndarray],
+    places: Sequence[Unknown] = (),
 ) -> list[dict[str, str]]:
     """Parameters whose estimate is the prior's doing, and why.
 
@@ -98,6 +100,7 @@ def not_estimated(
         effects: names of those that are effects, not frames.
         touched: (P,) whether any measurement that has weight depends on the parameter.
         lost: unknown -> (n,) which of its parameters are `not_trusted`.
+        places: the unknown poses of the rig's root.
 
     Returns:
         A `name` and a `why` for each.
@@ -113,9 +116,11 @@ def not_estimated(
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
     # What the data tell of each parameter where all others are held, over what its prior does.
     told = np.diag(np.linalg.inv(unit)) - 1.0
-    reasons = np.select(
-        [~touched, told > ROUNDING_OF_PRIOR], [UNMEASURED, TOLD_BEFORE], TIED_TO_ROOT
-    )
+    of_places = sum((v.sigma**-2.0 for v in places), np.zeros(6))
+    turns = np.concatenate([v.units for v in variables]) == "rad"
+    guessed = np.where(turns, of_places[:3].max(), of_places[3:].max()) * sigma**2
+    more = told > np.maximum(BEYOND_GUESSES * guessed, ROUNDING_OF_PRIOR)
+    reasons = np.select([~touched, more], [UNMEASURED, TOLD_BEFORE], TIED_TO_ROOT)
     directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
     found: dict[tuple[str, str], list[int]] = {}
     for i in np.flatnonzero(of_rejected):

@@ -160,8 +160,14 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         for t in terms
         if not isinstance(t.effect, FrameOffset)
     )
-    measured = estimate.touched(), not_trusted(estimate)
-    untold = not_estimated(estimate.variables, estimate.covariance, effects, *measured)
+    untold = not_estimated(
+        estimate.variables,
+        estimate.covariance,
+        effects,
+        touched=estimate.touched(),
+        lost=not_trusted(estimate),
+        places=[u for u in problem.variables.values() if u.role is Role.PLACE],
+    )
     return Solution(
         shared=shared,
         recordings=recordings,

@@ -53,7 +53,10 @@ def look_around(loop: Loop) -> bool:
     told = {body.stops.root for body in loop.problem.bodies}
     meshed = (s for s in loop.problem.scans if isinstance(s.meeting, MeshSurface))
     guessed = sorted({scan.stops.root for scan in meshed} - told)
-    settled = _look(loop, guessed, asked=TIMES_ASKED)
+    try:
+        settled = _look(loop, guessed, asked=TIMES_ASKED)
+    except NothingMetError as error:
+        raise NothingMetError(f"{error}{_likewise(loop)}") from None
     for _ in range(MOST_ROUNDS if settled and guessed else 0):
         kept, before = loop.values, _fits(loop)
         try:
@@ -72,6 +75,21 @@ def look_around(loop: Loop) -> bool:
         if not better:
             break
     return settled
+
+
+def _likewise(loop: Loop) -> str:
+    """What else of the scans meets nothing, but for the first of these; the end of a sentence."""
+    scans = loop.problem.scans
+    met = over_stops(partial(_meets, loop.values), scans)
+    tokens = [scan.group.token for scan, any_met in zip(scans, met, strict=True) if not any_met]
+    return f", and likewise {', '.join(tokens[1:])}" if len(tokens) > 1 else ""
+
+
+def _meets(values: Values, scan: ScanStop) -> bool:
+    try:
+        return scan.rows(values, None) is not None
+    except NothingMetError:
+        return False
 
 
 class _Fit(NamedTuple):
