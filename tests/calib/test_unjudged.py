@@ -84,3 +84,12 @@ def test_what_most_beams_meet_is_what_all_else_is_held_against(fitted, share, is
     group = Group("surface", MESH, f"surface_{most}")
     found = unjudged(replace(estimate, associations=fewer), [group])
     assert found == ({group} if is_most else set())
+
+
+@pytest.mark.parametrize(("beams", "is_judged"), [(4, False), (12, True)])
+def test_a_part_that_hardly_any_beam_meets_is_not_judged(fitted, beams, is_judged):
+    """Two or three of its beams may end at somebody who stands just before it."""
+    _, patches, estimate = fitted
+    part = next(part for part, some in patches.items() if len(some) == beams)
+    group = Group("surface", MESH, f"patch_{part}")
+    assert unjudged(estimate, [group]) == (set() if is_judged else {group})
