@@ -35,23 +35,27 @@ Numbers = Mapping[str, np.ndarray]
 
 def unjudged(estimate: Estimate, parts: Collection[Group]) -> set[Group]:
     """Those of some parts of the mesh that are narrow, and of whose beams a fit rejects most; and
-    those that most of all beams meet, or next to none that it keeps."""
+    those that most of all beams in their room meet, or next to none that it keeps."""
     if not parts:
         return set()
     groups = {kind_and_number(group.what): group for group in parts}
     kinds = {kind for kind, _ in groups}
     numbers = {kind: np.array(sorted(n for k, n in groups if k == kind)) for kind in kinds}
     work = partial(_counted, estimate.values, numbers)
-    counts = {kind: np.zeros((4, len(some)), int) for kind, some in numbers.items()}
-    for found in over_stops(work, estimate.scans, estimate.associations):
-        for kind, count in found.items():
-            counts[kind] += count
-    return {
-        groups[kind, number]
-        for kind, some in numbers.items()
-        for number, each in zip(some.tolist(), counts[kind].T.tolist(), strict=True)
-        if _narrow(*each) or _hardly_met(*each) or _of_most(*each)
-    }
+    rooms = {scan.room: {} for scan in estimate.scans}
+    found = over_stops(work, estimate.scans, estimate.associations)
+    for scan, of_scan in zip(estimate.scans, found, strict=True):
+        of_room = rooms[scan.room]
+        for kind, count in of_scan.items():
+            of_room[kind] = of_room.get(kind, 0) + count
+    judged: dict[Group, list[bool]] = {}
+    for counts in rooms.values():
+        for kind, some in numbers.items():
+            for number, each in zip(some.tolist(), counts[kind].T.tolist(), strict=True):
+                if each[0]:
+                    wrong = _narrow(*each) or _hardly_met(*each) or _of_most(*each)
+                    judged.setdefault(groups[kind, number], []).append(not wrong)
+    return {group for group, in_rooms in judged.items() if not any(in_rooms)}
 
 
 def _narrow(scans: int, every: int, met: int, kept: int) -> bool:

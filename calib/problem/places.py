@@ -142,8 +142,9 @@ class Places:
         source = self.part.source
         tracked = start.root_pose(source, stops)
         place = standing(source)
-        there = np.flatnonzero(place == place[stops[0]])  # a guess at one of them is of all
-        guess = start.guessed_pose(source, there)
+        guess = start.guessed_pose(source, stops)
+        if guess is None:  # one at another stop at which it stands alike will do
+            guess = start.guessed_pose(source, np.flatnonzero(place == place[stops[0]]))
         if guess is not None and self.reference:
             guess = self.problem.initial[self.reference] @ guess
         sigma = UNKNOWN_POSE

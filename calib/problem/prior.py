@@ -54,6 +54,13 @@ class JointPrior:
             start += v.dim
         return residual, d
 
+    @property
+    def sigmas(self) -> dict[str, np.ndarray]:
+        """Variable -> (n,) how well each of its parameters was known by itself."""
+        ends = np.cumsum([v.dim for v in self.held])[:-1]
+        each = np.split(np.sqrt(np.diag(self.covariance)), ends)
+        return dict(zip(self.variables, each, strict=True))
+
     def loosened(self, freed: Mapping[str, float]) -> JointPrior:
         """The same, where some variables have since moved by as many times their own sigma."""
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]

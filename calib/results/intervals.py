@@ -21,8 +21,8 @@ Where stops err together 0.92 to 0.95 of 95 % intervals hold, with 4 to 30 stops
 parameters that differ by stop (the worlds of `tests/calib/test_intervals.py`, 600 draws each);
 where rows err alone, 0.97 to 0.99.
 
-Of a ring most of whose beams are rejected the others may agree by chance: its interval is that of
-its prior.
+Of a ring half or more of whose beams are rejected the others may agree by chance: its interval is
+that from before the fit.
 
 Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
@@ -210,12 +210,15 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         sums.add_stop(cells, scatter)
     others = [*own_rows(layout, values), *_of_cells(estimate, places)]
     frames, paper, given = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
+    known = layout.outer()
+    before = {name: unknown.sigma for name, unknown in known.items()}
     for block, name, rows in of_graph(estimate.graph, layout, values):
         stated = block is None and problem.variables[name].role in KNOWN_BEFORE
         if stated or isinstance(block, JointPrior):
             A = rows.along(directions).A
             given += A.T @ A
             paper += A.T @ A if stated and name in frames else 0.0
+        before |= block.sigmas if isinstance(block, JointPrior) else {}
         if block is not None and block.kind == "target":
             rows, stops = rows._replace(stop=np.full(len(rows.b), stops)), stops + 1
         if not isinstance(block, KeptRows):
@@ -226,10 +229,10 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     )
     every = np.arange(directions.shape[1])
     sums.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
-    known, wider = layout.outer(), sums.wider()
+    wider = sums.wider()
     for name, lost in not_trusted(estimate).items():
         at = np.searchsorted(layout.kept, layout.columns([name])[lost])
-        wider[at] = np.maximum(wider[at], known[name].sigma[lost] / sigma[at])
+        wider[at] = np.maximum(wider[at], before[name][lost] / sigma[at])
     return Intervals(
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),

@@ -24,21 +24,19 @@ SEEN_SHARE, HARDLY_SEEN, ALONE_SHARE = 0.05, 0.02, 0.5
 # Of the leading parameter's share, in units of the priors, from which another is named beside it: a
 # choice; one with less changes what the data see by a hundredth, in squares.
 PARTNER = 0.1
-ROUNDING_OF_PRIOR = 1e-9  # of a prior: what is less is rounding, in a covariance of doubles
-BEYOND_GUESSES = 10.0  # times what the priors of the root's poses tell: a choice, clearly more
+LEADS_LAST = 1e-3  # of a preference: any other parameter of a direction leads it
 # Why a parameter is not estimated that is tied to no other.
-UNMEASURED = "no measurement depends on it, so its estimate and sigma are those from before the fit"
+UNMEASURED = (
+    "no measurement that has weight depends on it, so its estimate and sigma are those from before "
+    "the fit"
+)
 REJECTED_BEAMS = (
     "half or more of the beams that depend on it are rejected; the others may agree by chance, "
     "so its sigma is that from before the fit; what do these beams see?"
 )
-TOLD_BEFORE = (
-    "rig.yaml states it more exactly than the data tell it, so its estimate and sigma are those of "
-    "rig.yaml"
-)
-TIED_TO_ROOT = (
-    "tied to the pose of the rig's root, which is unknown too: the data determine only their "
-    "combination; track a body on the root, or measure it directly"
+TOLD_LESS = (
+    "the data tell it less exactly than what was known before, by themselves or as the pose of the "
+    "rig's root is unknown too; track a body on the root, or measure it directly"
 )
 
 
@@ -86,7 +84,6 @@ def not_estimated(
     effects: frozenset[str],
     touched: np.ndarray,
     lost: Mapping[str, np.ndarray],
-    places: Sequence[Unknown] = (),
 ) -> list[dict[str, str]]:
     """Parameters whose estimate is the prior's doing, and why.
 
@@ -100,7 +97,6 @@ def not_estimated(
         effects: names of those that are effects, not frames.
         touched: (P,) whether any measurement that has weight depends on the parameter.
         lost: unknown -> (n,) which of its parameters are `not_trusted`.
-        places: the unknown poses of the rig's root.
 
     Returns:
         A `name` and a `why` for each.
@@ -114,14 +110,9 @@ def not_estimated(
     dims = [v.dim for v in variables]
     owner = np.repeat([v.name for v in variables], dims)
     first = np.repeat(np.cumsum([0, *dims[:-1]]), dims)
-    # What the data tell of each parameter where all others are held, over what its prior does.
-    told = np.diag(np.linalg.inv(unit)) - 1.0
-    of_places = sum((v.sigma**-2.0 for v in places), np.zeros(6))
-    turns = np.concatenate([v.units for v in variables]) == "rad"
-    guessed = np.where(turns, of_places[:3].max(), of_places[3:].max()) * sigma**2
-    more = told > np.maximum(BEYOND_GUESSES * guessed, ROUNDING_OF_PRIOR)
-    reasons = np.select([~touched, more], [UNMEASURED, TOLD_BEFORE], TIED_TO_ROOT)
-    directions, leading = echelon(untold, np.where(np.isin(owner, sorted(effects)), 1.0, 0.3))
+    preference = np.where(np.isin(owner, sorted(effects)), 1.0, 0.3)
+    preference[of_rejected] = LEADS_LAST
+    directions, leading = echelon(untold, preference)
     found: dict[tuple[str, str], list[int]] = {}
     for i in np.flatnonzero(of_rejected):
         found.setdefault((str(owner[i]), REJECTED_BEAMS), []).append(int(i - first[i]))
@@ -131,7 +122,8 @@ def not_estimated(
         share = np.abs(column)
         partners = np.flatnonzero((share > PARTNER) & (np.arange(len(share)) != lead))
         tied_to = _grouped(owner[partners], [names[i] for i in partners])
-        why = _tied(tied_to) if tied_to else str(reasons[lead])
+        alone = TOLD_LESS if touched[lead] else UNMEASURED
+        why = _tied(tied_to) if tied_to else alone
         found.setdefault((str(owner[lead]), why), []).append(int(lead - first[lead]))
     whole = {v.name: v.dofs for v in variables}
     return [

@@ -165,8 +165,7 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         estimate.covariance,
         effects,
         touched=estimate.touched(),
-        lost=not_trusted(estimate),
-        places=[u for u in problem.variables.values() if u.role is Role.PLACE],
+        lost=not_trusted(estimate) if known is not None else {},  # else nothing was fitted
     )
     return Solution(
         shared=shared,

@@ -82,7 +82,7 @@ def anew(
     free: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     """Where Huber's cost of the beams is least, all but some parameters held; of these, those for
-    which Tukey's cost is lower there than where they are.
+    which Tukey's cost is lower there than where they are, if it is so for all together.
 
     Args:
         problem, values, associations: as of `begun`.
@@ -103,11 +103,12 @@ def anew(
     moves = np.flatnonzero(np.concatenate([free[name] for name in names]))
 
     def sums(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Normal equations of Huber's cost, and Tukey's cost of the beams that feel each parameter;
-        priors included."""
+        """Normal equations of Huber's cost; and Tukey's cost of the beams that feel each parameter,
+        last of all beams, priors included."""
         here = {**values, **{name: theta[i] for name, i in at.items()}}
         information, right = np.diag(1.0 / sigma**2), (mean - theta) / sigma**2
-        cost = np.square((theta - mean) / sigma) / 2
+        prior = np.square((theta - mean) / sigma) / 2
+        cost = np.append(prior, prior.sum())
         for gram, gradient, beams in over_stops(partial(_normal, here, at), scans, associations):
             information, right, cost = information + gram, right - gradient, cost + beams
         return information, right, cost
@@ -122,7 +123,13 @@ def anew(
         theta = theta + np.bincount(moves, step, len(theta))
         if np.all(np.abs(step) < SETTLED_SIGMAS / np.sqrt(np.diag(told))):
             break
-    theta = np.where(sums(theta)[2] < first, theta, before)
+    last = sums(theta)[2]
+    lower = last[:-1] < first[:-1]
+    if not np.all(lower[moves]):
+        theta = np.where(lower, theta, before)
+        last = sums(theta)[2]
+    if last[-1] >= first[-1]:
+        return {}
     return {name: theta[i] for name, i in at.items() if np.any(theta[i] != before[i])}
 
 
@@ -137,8 +144,8 @@ def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
 def _normal(
     values: Values, at: Mapping[str, np.ndarray], scan: ScanStop, association: Association
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One stop's weighted Gram matrix and gradient of some unknowns, and Tukey's cost of the beams
-    that feel each of their parameters."""
+    """One stop's weighted Gram matrix and gradient of some unknowns; and Tukey's cost of the beams
+    that feel each of their parameters, last of all beams."""
     rows = scan.rows(values, association)
     count, parts = len(rows.residual_m), []
     for name, i in at.items():
@@ -149,8 +156,9 @@ def _normal(
     z = np.where(rows.usable, rows.residual_m / rows.sigma_m, 0.0)
     huber = np.minimum(1.0, HUBER * rows.scale / np.maximum(np.abs(z), 1e-300))
     weighted = A.multiply((np.where(rows.usable, huber, 0.0) / rows.sigma_m**2)[:, None]).T.tocsr()
-    cost = (A != 0).T.astype(float) @ tukey_costs(z, rows.scale)
-    return (weighted @ A).toarray(), weighted @ rows.residual_m, cost
+    costs = tukey_costs(z, rows.scale)
+    felt = (A != 0).T.astype(float) @ costs
+    return (weighted @ A).toarray(), weighted @ rows.residual_m, np.append(felt, costs.sum())
 
 
 def _felt(values: Values, scan: ScanStop, association: Association) -> dict[str, np.ndarray]:

@@ -56,7 +56,7 @@ def look_around(loop: Loop) -> bool:
     try:
         settled = _look(loop, guessed, asked=TIMES_ASKED)
     except NothingMetError as error:
-        raise NothingMetError(f"{error}{_likewise(loop)}") from None
+        raise NothingMetError(_with_others(loop, str(error))) from None
     for _ in range(MOST_ROUNDS if settled and guessed else 0):
         kept, before = loop.values, _fits(loop)
         try:
@@ -77,12 +77,13 @@ def look_around(loop: Loop) -> bool:
     return settled
 
 
-def _likewise(loop: Loop) -> str:
-    """What else of the scans meets nothing, but for the first of these; the end of a sentence."""
+def _with_others(loop: Loop, said: str) -> str:
+    """What is said of a scan that meets nothing, with the others that meet nothing either."""
     scans = loop.problem.scans
     met = over_stops(partial(_meets, loop.values), scans)
     tokens = [scan.group.token for scan, any_met in zip(scans, met, strict=True) if not any_met]
-    return f", and likewise {', '.join(tokens[1:])}" if len(tokens) > 1 else ""
+    others = [token for token in tokens if token not in said]
+    return f"{said}, and likewise {', '.join(others)}" if others else said
 
 
 def _meets(values: Values, scan: ScanStop) -> bool:

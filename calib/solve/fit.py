@@ -139,8 +139,18 @@ def _go_on(loop: Loop, tolerance: float) -> None:
 
 
 def _hear_rejected(loop: Loop, tolerance: float) -> None:
-    """Begin anew with parameters most of whose beams are rejected, where the cost is lower then."""
-    if not loop.lost and loop.begin_rejected():
+    """Begin anew with parameters half or more of whose beams are rejected, and go back where the
+    cost does not end lower."""
+    if loop.lost:
+        return
+    loop.linearise_here()
+    kept, cost = loop.values, loop.cost()
+    if not loop.begin_rejected():
+        return
+    loop.settle_on(tolerance)
+    loop.linearise_here()
+    if loop.cost() > cost and not loop.lost:
+        loop.values = {**loop.values, **{n: x for n, x in kept.items() if n in loop.values}}
         loop.settle_on(tolerance)
 
 

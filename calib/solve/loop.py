@@ -313,15 +313,16 @@ class Loop(Descent):
         self.lay_out()
 
     def begin_rejected(self) -> bool:
-        """Take parameters most of whose beams have no weight to where these would have them, if the
-        cost is lower there; whether any moved."""
+        """Take parameters half or more of whose beams have no weight to where these would have
+        them, if the cost is lower there; whether any moved. What an earlier run tells of stays."""
 
         def compute() -> Answer:
             here = self.problem, self.values, self.associations
-            return anew(*here, rejected(*here))
+            return anew(*here, {n: x for n, x in rejected(*here).items() if n not in self.held})
 
         moved = self.journal.answer({**self.values, "": "rejected"}, compute)
-        self.values = {**self.values, **moved}
+        if moved:
+            self.values = {**self.values, **moved}
         return bool(moved)
 
     def _cells(self) -> dict[str, np.ndarray]:

@@ -236,22 +236,34 @@ def test_p_values_hold_their_level_where_beams_of_one_place_err_together():
     assert (np.array(small) < 0.001).mean() < 0.001
 
 
-def strewn(both_ways: bool) -> Change:
-    """Of all beams 8 % end anywhere on the second half of their way; or as far behind their end."""
-    rng = np.random.default_rng(4)
-
-    def change(stop, range_m, azimuth, elevation):
-        off = 0.05 + 0.45 * rng.random(len(range_m))
-        sign = np.where(both_ways & (rng.random(len(range_m)) < 0.5), -1.0, 1.0)
-        return np.where(rng.random(len(range_m)) < 0.08, range_m * (1.0 - sign * off), range_m)
-
-    return change
+def boxes(stop, range_m, azimuth, elevation):
+    """Boxes that the mesh lacks, 0.4 rad wide and 0.15 rad high, stand before 14 % of the walls."""
+    cell = np.floor(azimuth / 0.4).astype(int), np.floor(elevation / 0.15).astype(int)
+    inside = np.random.default_rng(stop).random((40, 40))[cell] < 0.14
+    return np.where(inside, range_m * (0.4 + 0.2 * np.abs(np.sin(7.0 * azimuth + stop))), range_m)
 
 
-def test_things_everywhere_that_the_mesh_lacks_are_clutter(studied):
-    """They stand before the mesh, which mixed pixels and errors of the LiDAR do not alone."""
-    found, _ = studied("strewn", strewn(both_ways=False))
-    assert found.explained and found.clutter > 0.05
-    assert found.share > 0.07 and found.expected == pytest.approx(found.share)
-    found, _ = studied("both ways", strewn(both_ways=True))
+def short(stop, range_m, azimuth, elevation):
+    """Of all beams 9 % read 5 % short, each by itself."""
+    alone = np.random.default_rng(stop).random(len(range_m)) < 0.09
+    return np.where(alone, 0.95 * range_m, range_m)
+
+
+def test_things_everywhere_that_the_mesh_lacks_are_clutter(studied, monkeypatch):
+    """They are wider than a beam, which errors of single beams are not."""
+    found, run = studied("boxes", boxes)
+    assert found.explained and found.share > 0.1 and found.clutter > 0.08
+
+    def nowhere(counts, rejected):
+        return np.zeros(counts.met.shape, bool)
+
+    monkeypatch.setattr("calib.diagnosis.rejects._crowded", nowhere)  # as where beams are few
+    found = rejects(stand_of(run, quiet), quiet)
+    assert found.explained and found.clutter == pytest.approx(found.share)
+    assert len(found.clutter_stops) == 12
+    assert "hit something that is not in the mesh" in found.sentence
+
+
+def test_single_beams_that_read_short_everywhere_are_no_clutter(studied):
+    found, _ = studied("short", short)
     assert found.beyond and not found.explained

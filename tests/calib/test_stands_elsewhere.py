@@ -10,9 +10,10 @@ import pytest
 
 from calib.blunders.told import of_many_parts, tokens
 from calib.diagnosis.rejects import rejects
-from calib.diagnosis.rejects.counts import Counts, Rejected
+from calib.diagnosis.rejects.counts import Counts
 from calib.diagnosis.rejects.counts import _rank as rank
 from calib.diagnosis.rejects.moved import moved
+from calib.diagnosis.rejects.rejected import Rejected
 from calib.results.check import check
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
@@ -99,6 +100,7 @@ def counted(away_m, time_s, recordings=1, reach_m=0.02):
             residual_m=np.concatenate([away_m[k] / slant for k in stops]),
             reach_m=np.full(len(none), reach_m),
             slant=np.tile(slant, len(stops)),
+            beside=np.ones(len(none), bool),
         ),
     )
 

@@ -7,14 +7,14 @@ weight is 0 there, where Huber's clipped residual would be a full one. So reject
 in bins of every covariate, those that read long and short together and each alone: the difference
 of these is the sum of their clipped residuals.
 
-A bin's share is held against the share elsewhere. Stops, and the patches of a metre or so that the
-beams meet, are the clusters, not beams: the variance of the difference is the cluster jackknife's
-(Bell and McCaffrey 2002), that by stops and that by patches added, and Student's t with the
-effective number of the fewer clusters (Carter, Schnepel and Steigerwald 2017) judges it. Sidak pays
-for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters, and
-regions of surfaces with stops as clusters. Where a covariate stands out, its interval is the one of
-the largest binomial likelihood (the scan statistic of Kulldorff 1997); its beams are set aside, and
-the rest is looked at again.
+A bin's share is held against the share elsewhere. Stops, and the regions of a mesh, or planes, that
+the beams meet, are the clusters, not beams: the variance of the difference is the cluster
+jackknife's (Bell and McCaffrey 2002), that by stops and that by regions added, and Student's t with
+the effective number of the fewer clusters (Carter, Schnepel and Steigerwald 2017) judges it. Sidak
+pays for all looks. Surfaces and stops are looked at as covariates too, with the other as clusters,
+and regions of surfaces with stops as clusters. Where a covariate stands out, its interval is the
+one of the largest binomial likelihood (the scan statistic of Kulldorff 1997); its beams are set
+aside, and the rest is looked at again.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEAST_P, LEVELS, after_looks
-from calib.diagnosis.rejects.counts import CellAxis, Counts, Rejected, count, meshed
+from calib.diagnosis.rejects.counts import CellAxis, Counts, count, meshed
 from calib.diagnosis.rejects.found import CLUTTER, Place, Rejects
 from calib.diagnosis.rejects.moved import WHOLE_SHARE, moved
+from calib.diagnosis.rejects.rejected import Rejected
 from calib.diagnosis.stand import Stand
 from calib.residuals.groups import ALONG_BEAMS, MESH_PARTS, REGION_PART, SURFACE
 from calib.solve.fit import Progress
@@ -78,8 +79,12 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     others = counts.rejected[~_any(counts, said) & ~elsewhere]
     less = others[~crowded[others.stop, others.surface]]
     beyond = len(others) / total - hit > CLUTTER
-    if beyond and less.in_the_way:  # too few on each surface for scans of few beams to say so
+    hit_at = crowded.any(axis=1)
+    if beyond and less.in_the_way(
+        len(counts.rejected) / total
+    ):  # too few on each surface for scans of few beams to say so
         hit, beyond = hit + len(less) / total, False
+        hit_at[less.stop] = True
     return Rejects(
         share=len(counts.rejected) / total,
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
@@ -87,7 +92,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
         places=places,
         meshed=meshed(stand),
         clutter=hit,
-        clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(crowded.any(axis=1))),
+        clutter_stops=tuple(counts.stop_names[i] for i in np.flatnonzero(hit_at)),
         beyond=beyond,
         beyond_m=float(np.median(others.residual_m)) if beyond and others.coherent else None,
         moved=[part for part, _ in parts],

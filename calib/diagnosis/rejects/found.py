@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from calib.blunders import told
-from calib.diagnosis.rejects.counts import MOSTLY_SHORT
 from calib.diagnosis.rejects.moved import MOST_NAMED, MovedPart
+from calib.diagnosis.rejects.rejected import MOSTLY_SHORT
 from calib.diagnosis.suggest import words
 from calib.problem.model import Source
 from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL, MESH_PARTS, part_of_mesh
@@ -158,8 +158,8 @@ class Rejects:
 
     Args:
         share: of all beams that meet a surface.
-        expected: the same, of the beams outside what is structured: what mixed pixels and clutter
-            explain, which is never more than `CLUTTER`.
+        expected: the same, of the beams outside what is structured: what mixed pixels may explain,
+            never more than `CLUTTER`, and clutter.
         p_adjusted: of the least likely place.
         places: where more is rejected than elsewhere, most first.
         meshed: whether surfaces are those of a mesh, and not planes found in the scans.

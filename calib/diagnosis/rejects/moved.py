@@ -16,7 +16,8 @@ import numpy as np
 
 from calib.blunders import told
 from calib.blunders.chance import LEAST_P
-from calib.diagnosis.rejects.counts import AGREES, Counts, Rejected
+from calib.diagnosis.rejects.counts import Counts
+from calib.diagnosis.rejects.rejected import AGREES, Rejected
 from calib.problem.model import Source
 from calib.residuals.groups import ALONG_NORMAL, REGION_PART, SURFACE, part_of_mesh
 from calib.rig.suspect import listed
