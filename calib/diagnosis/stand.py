@@ -44,10 +44,7 @@ from sensors.holds import spread_known
 SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
-# Beams of a scan at most that say between which shapes of a grid those of the next one are, and the
-# p-value with them above which no more beams are asked: choices. A name needs a p-value some
-# hundred times smaller, and what only 131,072 beams show is smaller than errors of a mesh.
-REFINING_BEAMS, TOO_LIKELY = 4_096, 0.05
+REFINING_BEAMS = 4_096  # of a scan, to find between which shapes the best is: a choice
 
 
 @dataclass(frozen=True)
@@ -335,7 +332,7 @@ class Look:
             linear, at, _ = stand.linearise(shaped, progress, REFINING_BEAMS if left else None)
             scores = project(linear, linear.candidates, stand.spent)
             named = screen(scores, shaped, at, self.named.common)
-            if not named.candidates or (left and named.candidates[0].p_value > TOO_LIKELY):
+            if not named.candidates:
                 return self, candidate
             near = replace(self, linear=linear, named=named)
             (found,) = named.candidates

@@ -28,10 +28,11 @@ PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing
 # Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
-# labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off. Regions
-# of a mesh are as wide as what errs together where errors are smooth over a metre (2 pi m2): with
-# 1.2 m the alignment was turned by 1.3 of its sigmas (rms of 24 labs, 24 stops), with 2.5 m by 1.1.
-PATCHES_M = {REGION_PART: 2.5, PATCH: 0.5}
+# labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off. Errors
+# that are smooth over a metre err together over 2 pi m2: with regions of 1.2 m the mesh was turned
+# by 1.30 of its sigmas (rms of 24 labs of 24 stops), with 2 m by 1.14, with 2.5 m by 1.10; but with
+# 2.5 m a tracker bent by 3 mm was scatter of the targets, in the one of such worlds that is a test.
+PATCHES_M = {REGION_PART: 2.0, PATCH: 0.5}
 PLANE_PATCHES_M = {REGION_PART: 1.2, PATCH: 0.3}
 ROOM_M2 = 200.0
 

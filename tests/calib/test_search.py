@@ -120,7 +120,7 @@ def test_poses_that_scatter_of_the_joints_moves_far_are_no_blunders(tmp_path, wi
 @pytest.mark.long
 def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
     """Five targets that are 3 mm off take the mesh with them, which then seems shifted."""
-    done, _ = found(tmp_path, seed=33, target_scatter=3.0)
+    done, _ = found(tmp_path, seed=36, target_scatter=3.0)
     assert done.looks[1].stand.model.names[-1] == "mesh_shift"
     assert not done.found and [c.effect.name for c in done.chance] == ["target_scatter"]
     assert "mesh_shift" not in done.looks[-1].stand.model.names
