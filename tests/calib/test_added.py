@@ -6,6 +6,7 @@ import pytest
 from calib.effects.own.formula import FormulaEffect
 from calib.problem import build
 from calib.problem.model import Model, Source
+from calib.problem.prior import JointPrior
 from calib.results.intervals import intervals
 from calib.results.observability import not_trusted
 from calib.simulation import Spec
@@ -67,6 +68,12 @@ def with_ring_off(source: Source, ring: int, off: rescans.Change) -> Source:
     return Source.open(source.recording.folder)
 
 
+def clutter(seed: int) -> rescans.Change:
+    """Beams end anywhere on the last tenth of their way."""
+    rng = np.random.default_rng(seed)
+    return lambda stop, range_m, *_: -0.1 * range_m * rng.random(len(range_m))
+
+
 def test_a_ring_all_of_whose_beams_are_far_off_is_found(tmp_path):
     """By 0.3 m: one or two stray beams hold it where it is, with a sigma of some mm."""
     source, truth = made(tmp_path / "rec", SMALL)
@@ -93,15 +100,24 @@ def test_a_ring_whose_beams_fit_nothing_stays_and_it_is_said_why(tmp_path):
 
 
 def test_a_ring_that_meets_clutter_is_not_known_by_the_beams_that_agree_by_chance(tmp_path):
-    """Its beams end anywhere on the last tenth of their way."""
     source, truth = made(tmp_path / "rec", SMALL)
-    rng = np.random.default_rng(5)
-    source = with_ring_off(
-        source, 12, lambda _, range_m, *__: -0.1 * range_m * rng.random(len(range_m))
-    )
+    source = with_ring_off(source, 12, clutter(5))
     found = solve(build([source], Model()))
     offset, known = found.values["ring_range_offset"], intervals(found).of(["ring_range_offset"])
     sigma, true = np.sqrt(np.diag(known.covariance)), truth["effects"]["ring_range_offset"]
     assert np.abs(offset[12] - true[12]) > 4e-3  # it is off, by more than others' sigmas
     assert sigma[12] > 0.03
     assert np.median(sigma) < 1.5e-3
+
+
+def test_what_an_earlier_run_knew_of_a_ring_that_meets_clutter_stays(tmp_path):
+    source, truth = made(tmp_path / "rec", SMALL)
+    source = with_ring_off(source, 12, clutter(5))
+    problem = build([source], Model())
+    rings = problem.variables["ring_range_offset"]
+    true = np.array(truth["effects"]["ring_range_offset"])
+    prior = JointPrior([rings], {rings.name: true}, np.eye(rings.dim) * 0.002**2)
+    found = solve(problem, prior=prior)
+    known = intervals(found).of([rings.name])
+    assert abs(found.values[rings.name][12] - true[12]) < 0.01
+    assert np.sqrt(known.covariance[12, 12]) == pytest.approx(0.002, rel=0.2)

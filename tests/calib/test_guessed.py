@@ -15,6 +15,7 @@ from calib.residuals.surfaces import PlaneSurface
 from calib.results.observability import seen_alone
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
+from calib.simulation import Spec
 from calib.solve.fit import solve
 from calib.solve.loop import _beyond_doubt
 from chains import se3
@@ -22,6 +23,8 @@ from tests.worlds import World, write
 from tests.worlds.beams import model
 from tests.worlds.hardware import built
 from tests.worlds.session import visited
+
+from .simulated import QUICK, made
 
 GUESS = [f"base_guess.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 ROOM = World(seed=3, locations=1, stops=12, beams=8000, stands=True)
@@ -172,3 +175,14 @@ def test_a_scan_is_alone_where_no_other_sees_what_it_does(beams, alone):
         ],
     )
     assert [scan.where for scan in seen_alone(estimate)] == list(alone)
+
+
+def test_a_guess_at_one_stop_is_of_all_where_the_base_never_moves(tmp_path):
+    """Also for the fit of a fold from which that stop is held out."""
+    spec = Spec(tracker=None, targets=0, base_moves="never", **QUICK | {"locations": 3})
+    made(tmp_path / "rec", spec)
+    table = pd.read_csv(tmp_path / "rec/stops.csv")
+    table.loc[1:, GUESS] = np.nan
+    table.to_csv(tmp_path / "rec/stops.csv", index=False)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run")
+    assert run.summary["rms_mm"]["held_out"] < 10.0
