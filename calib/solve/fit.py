@@ -144,14 +144,13 @@ def _hear_rejected(loop: Loop, tolerance: float) -> None:
     if loop.lost:
         return
     loop.linearise_here()
-    kept, cost = loop.values, loop.cost()
+    kept, cost = loop.kept(), loop.cost()
     if not loop.begin_rejected():
         return
     loop.settle_on(tolerance)
     loop.linearise_here()
-    if loop.cost() > cost and not loop.lost:
-        loop.values = {**loop.values, **{n: x for n, x in kept.items() if n in loop.values}}
-        loop.settle_on(tolerance)
+    if loop.lost or loop.cost() > cost:
+        loop.go_back(kept)
 
 
 def _stay_below(loop: Loop, descend: Callable[[], bool]) -> None:

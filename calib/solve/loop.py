@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -310,6 +311,16 @@ class Loop(Descent):
             self.values[name] = started(unknown, known, unknown.mean)
         if not self.passes:  # later, the fit itself knows better
             self.values |= begun(self.problem, self.values, self.associations, self.start.state)
+        self.lay_out()
+
+    def kept(self) -> dict[str, Any]:
+        """Where the fit is now, for `go_back`."""
+        names = ("given", "problem", "values", "associations", "seen", "lost")
+        return {name: getattr(self, name) for name in names}
+
+    def go_back(self, kept: Mapping[str, Any]) -> None:
+        """Be where the fit was."""
+        vars(self).update(kept)
         self.lay_out()
 
     def begin_rejected(self) -> bool:
