@@ -29,9 +29,10 @@ PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
 # labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off. Errors
-# that are smooth over a metre err together over 2 pi m2: with regions of 1.2 m the mesh was turned
-# by 1.30 of its sigmas (rms of 24 labs of 24 stops), with 2 m by 1.14, with 2.5 m by 1.10.
-PATCHES_M = {REGION_PART: 2.5, PATCH: 0.5}
+# of a mesh that are smooth over a metre err together over 2 pi m2, and regions are too small for
+# that: in 40 labs of 24 stops it was turned by 1.32 of its sigmas (rms), and with regions of 2.5 m
+# by 1.10 (24 of them). But then fits to a mesh of wrong scale take 2.4 times as many passes.
+PATCHES_M = {REGION_PART: 1.2, PATCH: 0.5}
 PLANE_PATCHES_M = {REGION_PART: 1.2, PATCH: 0.3}
 ROOM_M2 = 200.0
 

@@ -32,9 +32,8 @@ TIMES = 10  # the detectable size
 UNCHANGED = 1.0  # sigma of the good recording's fit
 # Times as many passes as the good recording's fit, which takes 10: of what is given up (markers
 # exchanged: 2.1), and of what comes to an optimum with something wrong beside it (a mesh of wrong
-# scale: 10.7; it was 4.4 with regions of 1.2 m, which hold the mesh where it is more than those of
-# 2.5 m do, and too much: see `PATCHES_M`).
-GIVEN_UP, ARRIVED = 2.2, 11.0
+# scale: 4.4).
+GIVEN_UP, ARRIVED = 2.2, 5.0
 LONGEST_S = 60
 ENOUGH = 30  # cases that were run, for their passes to be looked at
 

@@ -56,7 +56,7 @@ def test_an_effect_that_no_shape_of_the_grid_fits_is_named_in_its_own(tmp_path):
 def test_what_was_named_beside_chance_lets_others_take_its_place(tmp_path):
     """Three effects, none of which explains as much alone as a zero of its own at every stop: all
     are found, one beside the other, and the zeros are not."""
-    hidden = {"label_range_offset": 5.0, "optitrack_distortion": 4.0, "warmup_drift@400": 3.0}
+    hidden = {"label_range_offset": 5.0, "optitrack_distortion": 3.0, "warmup_drift@400": 3.0}
     done, _ = found(tmp_path, seed=738, **hidden)
     names = [step.effect.family for step in done.found]
     assert sorted(names) == ["label_range_offset", "optitrack_distortion", "warmup_drift"]
