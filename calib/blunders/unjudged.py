@@ -24,11 +24,11 @@ KEPT_BEAMS = 0.5  # of those that meet a part: with fewer, their median is of so
 # Beams of a scan that meet a part, on average of those that do: with fewer, none has others on both
 # sides, and all may be at its edges.
 INSIDE_BEAMS = 3.0
-# Beams that a fit keeps on a part, of which it is judged: where people hide 40 % of the walls, one
-# beam in 250 ends by chance just before what it should meet. One or two such made sound patches of
-# one to six beams 5 and 9 mm off, at five sigmas; that three of five are such, no room shows.
+# Beams that a fit must keep on a part to judge it: where people hide 40 % of the walls, about one
+# beam in 250 ends by chance just before what it should meet. One or two such made sound patches, of
+# two and six beams, 9 and 5 mm off at five sigmas. Three such of five would be one in a million.
 FEWEST_KEPT = 5
-MOST_OF_ALL = 0.5  # of all: what the minority of the rows says, no more can be a mishap
+MOST_OF_ALL = 0.5  # of the beams in a room: if more meet a part, no majority contradicts it
 Numbers = Mapping[str, np.ndarray]
 """Kind of part -> the numbers (n,) of some parts, ascending."""
 
@@ -53,21 +53,15 @@ def unjudged(estimate: Estimate, parts: Collection[Group]) -> set[Group]:
         for kind, some in numbers.items():
             for number, each in zip(some.tolist(), counts[kind].T.tolist(), strict=True):
                 if each[0]:
-                    wrong = _narrow(*each) or _hardly_met(*each) or _of_most(*each)
-                    judged.setdefault(groups[kind, number], []).append(not wrong)
+                    judged.setdefault(groups[kind, number], []).append(_is_judged(*each))
     return {group for group, in_rooms in judged.items() if not any(in_rooms)}
 
 
-def _narrow(scans: int, every: int, met: int, kept: int) -> bool:
-    return kept < KEPT_BEAMS * met and met < INSIDE_BEAMS * scans
-
-
-def _hardly_met(scans: int, every: int, met: int, kept: int) -> bool:
-    return kept < FEWEST_KEPT
-
-
-def _of_most(scans: int, every: int, met: int, kept: int) -> bool:
-    return met > MOST_OF_ALL * every
+def _is_judged(scans: int, every: int, met: int, kept: int) -> bool:
+    """Of a part, in how many scans it is met, how many beams these and all others of its room have,
+    how many meet it, and how many of them a fit keeps."""
+    narrow = kept < KEPT_BEAMS * met and met < INSIDE_BEAMS * scans
+    return not narrow and kept >= FEWEST_KEPT and met <= MOST_OF_ALL * every
 
 
 def _counted(

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Meeting(Protocol):
         not_met: what is wrong where no beam of a scan meets it; the end of a sentence.
     """
 
-    not_met: str
+    not_met: ClassVar[str]
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
@@ -73,10 +73,9 @@ class MeshSurface:
     reference: Reference
     footprint_rad: float
     without: Mapping[str, Collection[int]] = field(default_factory=dict)
-    not_met: str = field(
-        default="meets a surface of the mesh; check the scan's units, the mesh's frame, and where "
-        "the stop starts (base_guess, targets)",
-        init=False,
+    not_met: ClassVar[str] = (
+        "meets a surface of the mesh; check the scan's units, the mesh's frame, and where the stop "
+        "starts (base_guess, targets)"
     )
 
     @cached_property
@@ -179,10 +178,9 @@ class PlaneSurface:
 
     planes: Planes
     variable: str
-    not_met: str = field(
-        default="meets a plane, and planes are what was found in the scans, as there is no mesh; "
-        "check where the stop starts (base_guess)",
-        init=False,
+    not_met: ClassVar[str] = (
+        "meets a plane, and planes are what was found in the scans, as there is no mesh; check "
+        "where the stop starts (base_guess)"
     )
 
     @cached_property

@@ -43,7 +43,6 @@ from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Role
-from calib.results.observability import not_trusted
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -230,7 +229,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     every = np.arange(directions.shape[1])
     sums.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
     wider = sums.wider()
-    for name, lost in not_trusted(estimate).items():
+    for name, lost in estimate.not_trusted.items():
         at = np.searchsorted(layout.kept, layout.columns([name])[lost])
         wider[at] = np.maximum(wider[at], before[name][lost] / sigma[at])
     return Intervals(

@@ -12,7 +12,6 @@ from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
 from calib.rig.inventory import odd_numbers, odd_rig
 from calib.rig.suspect import listed
-from calib.solve.added import rejected
 from calib.solve.estimate import Estimate
 from calib.solve.otherwise.rooms import rooms_turned
 
@@ -96,15 +95,14 @@ def not_estimated(
         covariance: (P, P) joint marginal.
         effects: names of those that are effects, not frames.
         touched: (P,) whether any measurement that has weight depends on the parameter.
-        lost: unknown -> (n,) which of its parameters are `not_trusted`.
+        lost: unknown -> (n,) which of its parameters are not trusted; see `Estimate`.
 
     Returns:
         A `name` and a `why` for each.
     """
     names = [f"{v.name}.{dof}" for v in variables for dof in v.dofs]
     sigma = np.concatenate([v.sigma for v in variables])
-    unit = covariance / np.outer(sigma, sigma)
-    values, vectors = np.linalg.eigh(unit)
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
     untold = vectors[:, values > UNTOLD]
     of_rejected = np.concatenate([lost.get(v.name, np.zeros(v.dim, bool)) for v in variables])
     dims = [v.dim for v in variables]
@@ -172,13 +170,6 @@ def _grouped(owner: Sequence[str], names: Sequence[str]) -> str:
         by_owner.setdefault(variable, []).append(name)
     listed = [found[0] if len(found) == 1 else variable for variable, found in by_owner.items()]
     return " and ".join(listed)
-
-
-def not_trusted(estimate: Estimate) -> dict[str, np.ndarray]:
-    """Unknown of the calibration -> which of its parameters (P,) hang on beams most of which are
-    rejected; of unknowns with any."""
-    found = rejected(estimate.problem, estimate.values, estimate.associations)
-    return {v.name: found[v.name] for v in estimate.variables if v.name in found}
 
 
 def _tied(partners: str) -> str:

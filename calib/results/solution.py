@@ -18,7 +18,7 @@ from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
 from calib.results.intervals import Intervals
-from calib.results.observability import not_estimated, not_trusted
+from calib.results.observability import not_estimated
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -165,7 +165,7 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         estimate.covariance,
         effects,
         touched=estimate.touched(),
-        lost=not_trusted(estimate) if known is not None else {},  # else nothing was fitted
+        lost=estimate.not_trusted if known is not None else {},  # else nothing was fitted
     )
     return Solution(
         shared=shared,

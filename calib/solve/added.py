@@ -64,7 +64,7 @@ def rejected(
     Returns:
         Unknown -> (P,) bool, of unknowns with any.
     """
-    acting = {term.variable for scan in problem.scans for term in scan.terms}
+    acting = _acting(problem)
     counts = {n: np.zeros((2, u.dim)) for n, u in problem.variables.items() if n in acting}
     for found in over_stops(partial(_felt, values), problem.scans, associations):
         for name in (n for n in found if n in counts):
@@ -92,7 +92,7 @@ def anew(
         Unknown -> (P,), of unknowns that moved.
     """
     scans, known = problem.scans, problem.variables
-    acting = {term.variable for scan in scans for term in scan.terms}
+    acting = _acting(problem)
     names = [n for n in known if n in acting and n in free and np.any(free[n])]
     if not names:
         return {}
@@ -137,8 +137,13 @@ def declared(problem: Problem, held: Collection[str]) -> dict[str, np.ndarray]:
     """Where those unknowns begin whose effect says so, of those that single beams feel and of which
     no earlier estimate (`held`) tells."""
     known, initial = problem.variables, problem.initial
-    felt = {t.variable for scan in problem.scans for t in scan.terms} & set(known) - set(held)
+    felt = _acting(problem) & set(known) - set(held)
     return {n: initial[n] for n in felt if not np.array_equal(initial[n], known[n].mean)}
+
+
+def _acting(problem: Problem) -> set[str]:
+    """The unknowns of effects that single beams may feel."""
+    return {term.variable for scan in problem.scans for term in scan.terms}
 
 
 def _normal(

@@ -88,9 +88,10 @@ def _with_others(loop: Loop, said: str) -> str:
 
 def _meets(values: Values, scan: ScanStop) -> bool:
     try:
-        return scan.rows(values, None) is not None
+        scan.rows(values, None)
     except NothingMetError:
         return False
+    return True
 
 
 class _Fit(NamedTuple):

@@ -16,6 +16,7 @@ from calib.problem.spread import spread_of
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import Association
 from calib.residuals.scan import ScanStop
+from calib.solve.added import rejected
 from calib.solve.graph import FactorGraph, Graph
 
 # Of a state, beside an unknown's NAME: the parameters of a vector, and the value at which the beams
@@ -132,6 +133,13 @@ class Estimate:
                 columns = layout.columns([name])
                 seen[columns] |= layout.moves(derivative[name], columns)
         return seen[layout.columns([v.name for v in self.variables])]
+
+    @cached_property
+    def not_trusted(self) -> dict[str, np.ndarray]:
+        """Unknown of the calibration -> which of its parameters (P,) hang on beams half or more of
+        which are rejected; of unknowns with any."""
+        found = rejected(self.problem, self.values, self.associations)
+        return {v.name: found[v.name] for v in self.variables if v.name in found}
 
     def covariance_of(self, names: Sequence[str]) -> np.ndarray:
         """Joint marginal covariance of unknowns that are no surface's, in the order given."""

@@ -313,14 +313,14 @@ class Loop(Descent):
             self.values |= begun(self.problem, self.values, self.associations, self.start.state)
         self.lay_out()
 
-    def kept(self) -> dict[str, Any]:
+    def kept(self) -> tuple[Any, ...]:
         """Where the fit is now, for `go_back`."""
-        names = ("given", "problem", "values", "associations", "seen", "lost")
-        return {name: getattr(self, name) for name in names}
+        return self.given, self.problem, self.values, self.associations, self.seen
 
-    def go_back(self, kept: Mapping[str, Any]) -> None:
-        """Be where the fit was."""
-        vars(self).update(kept)
+    def go_back(self, kept: tuple[Any, ...]) -> None:
+        """Be where the fit was, before it was lost if it is."""
+        self.given, self.problem, self.values, self.associations, self.seen = kept
+        self.lost = False
         self.lay_out()
 
     def begin_rejected(self) -> bool:

@@ -8,7 +8,6 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.results.intervals import intervals
-from calib.results.observability import not_trusted
 from calib.simulation import Spec
 from calib.solve.fit import solve
 from sensors.documents import Marks
@@ -50,15 +49,10 @@ def test_an_effect_that_explains_nothing_begins_at_zero(tmp_path):
     assert abs(found.values["sector"][0]) < 1e-3
 
 
-def rings_of(source: Source) -> tuple[np.ndarray, np.ndarray]:
-    """Elevation of each ring, rad, and how far from it a beam of its own lies at most."""
-    elevation = np.asarray(source.rig.lidar.elevation_rad)
-    return elevation, np.min(np.abs(np.diff(np.sort(elevation)))) / 2
-
-
 def with_ring_off(source: Source, ring: int, off: rescans.Change) -> Source:
     """The recording with the ranges of a ring longer by `off`."""
-    elevation, half = rings_of(source)
+    elevation = np.asarray(source.rig.lidar.elevation_rad)
+    half = np.min(np.abs(np.diff(np.sort(elevation)))) / 2
 
     def change(stop, range_m, azimuth, elevations):
         mine = np.abs(elevations - elevation[ring]) < half
@@ -94,7 +88,7 @@ def test_a_ring_whose_beams_fit_nothing_stays_and_it_is_said_why(tmp_path):
 
     source = with_ring_off(source, 12, apart)
     found = solve(build([source], Model()))
-    lost = not_trusted(found)["ring_range_offset"]
+    lost = found.not_trusted["ring_range_offset"]
     assert np.flatnonzero(lost).tolist() == [12]
     assert abs(found.values["ring_range_offset"][12]) < 1e-9
 

@@ -80,13 +80,13 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     less = others[~crowded[others.stop, others.surface]]
     beyond = len(others) / total - hit > CLUTTER
     hit_at = crowded.any(axis=1)
-    if beyond and less.in_the_way(
-        len(counts.rejected) / total
-    ):  # too few on each surface for scans of few beams to say so
+    share = len(counts.rejected) / total
+    # Of scans with few beams there may be too few on each surface to say so of it.
+    if beyond and less.in_the_way(share):
         hit, beyond = hit + len(less) / total, False
         hit_at[less.stop] = True
     return Rejects(
-        share=len(counts.rejected) / total,
+        share=share,
         expected=min(usual / max(outside, 1.0 / total), CLUTTER + hit),
         p_adjusted=least,
         places=places,

@@ -15,9 +15,9 @@ AGREES = 0.5
 # Share of rejected beams that end before the mesh, from which something stands in their way: a
 # choice. Of rooms of which the mesh lacks the furniture it is all, of people before walls 0.95.
 MOSTLY_SHORT = 0.9
-# Share of rejected beams beside others, on the way from what chance makes of beams that are each
-# rejected by themselves to all of them, from which what they hit is wider than a beam: a choice. Of
-# rooms of which the mesh lacks the furniture, and of people, it was 0.64 to 0.94.
+# Share of rejected beams that have another beside them, 0 if no more do than by chance and 1 if all
+# do, from which what they hit is wider than a beam: a choice. Of rooms of which the mesh lacks the
+# furniture, and of people, it was 0.64 to 0.94.
 MOSTLY_BESIDE = 0.5
 
 
