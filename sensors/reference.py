@@ -234,6 +234,15 @@ class Reference:
             patch[hit] = self._ways.patch(patch[hit], mine, self.surface[mine], cells)
         return patch
 
+    def from_middle_m(self, triangle: np.ndarray, point_m: np.ndarray, size_m: float) -> np.ndarray:
+        """How far (N, 2) each hit is from the middle of its patch, along the axes of its surface's
+        tangent plane; 0 where the beam missed. Arguments as of `patch`."""
+        away_m = np.zeros((len(triangle), 2))
+        hit = np.flatnonzero(triangle >= 0)
+        surface = self.surface[triangle[hit]]
+        away_m[hit] = self._grid.from_middle_m(surface, point_m[hit], size_m)
+        return away_m
+
     def facts(self, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Label, intensity and surface (N,) of triangles (N,); -1, NaN and -1 of triangle -1."""
         surface = np.where(triangle >= 0, self.surface[triangle], -1)

@@ -91,14 +91,16 @@ class SurfaceGrid:
         """Patch (N,) int64, counted over all surfaces, of points (N, 3) on given surfaces (N,)."""
         cells = self._cells(cell_m)
         first = np.cumsum(cells.prod(axis=1)) - cells.prod(axis=1)
-        per_m = cells / self.size_m
-        along = (self.axes * per_m[:, :, None]).take(surface, axis=0)
-        steps = np.einsum("nki,ni->nk", along, point_m) - (self.corner_m * per_m).take(
-            surface, axis=0
-        )
-        last = cells.take(surface, axis=0) - 1
-        row, column = np.clip(steps, 0, last).astype(np.int64).T
-        return first.take(surface) + row * (last[:, 1] + 1) + column
+        _, at = self._steps(surface, point_m, cells)
+        row, column = at.T
+        return first.take(surface) + row * cells[:, 1].take(surface) + column
+
+    def from_middle_m(self, surface: np.ndarray, point_m: np.ndarray, cell_m: float) -> np.ndarray:
+        """How far (N, 2) points (N, 3) on given surfaces (N,) are from the middle of their patch,
+        along the axes of its surface."""
+        cells = self._cells(cell_m)
+        steps, at = self._steps(surface, point_m, cells)
+        return (steps - at - 0.5) * (self.size_m / cells).take(surface, axis=0)
 
     def patches(self, cell_m: float) -> np.ndarray:
         """How many patches (S,) each surface has."""
@@ -114,6 +116,17 @@ class SurfaceGrid:
         first = int(cells[:surface].prod(axis=1).sum())
         step = np.array(divmod(patch - first, int(cells[surface, 1]))) + 0.5
         return surface, self.corner_m[surface] + step * self.size_m[surface] / cells[surface]
+
+    def _steps(
+        self, surface: np.ndarray, point_m: np.ndarray, cells: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How many cells (N, 2) points (N, 3) on given surfaces (N,) are from the corner along each
+        axis, and the last cells (N, 2) int64 that begin before them."""
+        per_m = cells / self.size_m
+        along = (self.axes * per_m[:, :, None]).take(surface, axis=0)
+        steps = np.einsum("nki,ni->nk", along, point_m)
+        steps -= (self.corner_m * per_m).take(surface, axis=0)
+        return steps, np.clip(steps, 0, cells.take(surface, axis=0) - 1).astype(np.int64)
 
     def _cells(self, cell_m: float) -> np.ndarray:
         """Cells (S, 2) along the axes, each about `cell_m` wide: no slivers at the far rim."""

@@ -207,7 +207,7 @@ def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """Surfaces of the mesh, and parts of them: a wall that has moved, and one that is warped. The
     only region of a surface, or its only patch, is that surface."""
     for name, cells in problem.cells.items():
-        if not cells.of_mesh:
+        if not cells.of_mesh or cells.axis is not None:
             continue
         unknown, columns = whole.layout.unknowns[name], whole.layout.columns([name])
         alone = np.bincount(cells.surface)[cells.surface] == 1

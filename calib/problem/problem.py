@@ -66,7 +66,7 @@ class SourceStops:
 @dataclass(frozen=True)
 class SurfaceCells:
     """Parts of a mesh, or of planes, that stand off the room, each by an unknown way along its
-    normal.
+    normal, or by an unknown tilt.
 
     Args:
         column: what kind of part: surface, region or patch.
@@ -74,6 +74,8 @@ class SurfaceCells:
         parts: (P,) those that any beam meets, ascending.
         surface: (P,) the surface that each is of.
         room: the mesh, or the recording whose planes these are.
+        axis: along which they tilt, as of `calib.residuals.beams.Association.from_middle_m`; None
+            where they stand off as a whole.
     """
 
     column: str
@@ -81,6 +83,7 @@ class SurfaceCells:
     parts: np.ndarray
     surface: np.ndarray
     room: int | str
+    axis: int | None = None
 
     @property
     def of_mesh(self) -> bool:
@@ -167,7 +170,9 @@ class Problem:
 
     def with_cells(self, unknowns: Sequence[Unknown], cells: Mapping[str, SurfaceCells]) -> Problem:
         """The problem with unknowns of its surfaces; its scans know which of these moves what."""
-        numbers = {name: CellNumbers.of(some.column, some.parts) for name, some in cells.items()}
+        numbers = {
+            name: CellNumbers.of(some.column, some.parts, some.axis) for name, some in cells.items()
+        }
 
         def numbered(scan: ScanStop) -> ScanStop:
             felt = {n: numbers[n] for n, some in cells.items() if some.room == scan.room}

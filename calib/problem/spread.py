@@ -18,7 +18,7 @@ import numpy as np
 from calib.effects import Site
 from calib.forward import Term
 from calib.problem.problem import Block, Problem
-from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of
+from calib.problem.surfaces import SURFACE_SHARES, cell_sigma_m, kinds_of, scatter
 from calib.problem.unknowns import Role, Unknown, is_read
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import PlaneSurface
@@ -215,7 +215,7 @@ def _widened(problem: Problem, whose: Whose, sd: float) -> Problem:
     wider = replace(problem, scans=scans, aside=aside)
     sigma_m = sigmas(wider)[whose][0]
     cells = {
-        name: replace(known, sigma=np.full(known.dim, sigma_m))
+        name: replace(known, sigma=np.full(known.dim, scatter(problem.cells[name], sigma_m)))
         for name, known in problem.variables.items()
         if name in problem.cells and problem.cells[name].kind == what
     }

@@ -48,38 +48,59 @@ class Association:
     Args:
         part: (N,) triangle or plane; -1 for nothing.
         patches: kind of patch -> (N,) patch of the surface, -1 for none; empty if not kept.
+        from_middle_m: (N, 2) where in its region each beam ends, along two axes of the surface;
+            None if not kept.
     """
 
     part: np.ndarray
     patches: Mapping[str, np.ndarray] = field(default_factory=dict)
+    from_middle_m: np.ndarray | None = None
 
     def only(self, some: np.ndarray) -> Association:
         """What some of the beams (n,) meet."""
-        return Association(self.part[some], {n: each[some] for n, each in self.patches.items()})
+        patches = {n: each[some] for n, each in self.patches.items()}
+        away_m = None if self.from_middle_m is None else self.from_middle_m[some]
+        return Association(self.part[some], patches, away_m)
 
 
 @dataclass(frozen=True, eq=False)
 class CellNumbers:
-    """Which component of an unknown of the surfaces moves each part of a kind.
+    """Which component of an unknown of the surfaces moves, or tilts, each part of a kind.
 
     Args:
         column: the kind: surface, region or patch.
         number: (L + 1,) of each part; -1 for those that it does not move, the last one too.
+        axis: along which it tilts them, as of `Association.from_middle_m`; None where it moves them
+            as a whole.
     """
 
     column: str
     number: np.ndarray
+    axis: int | None = None
 
     @classmethod
-    def of(cls, column: str, parts: np.ndarray) -> CellNumbers:
+    def of(cls, column: str, parts: np.ndarray, axis: int | None = None) -> CellNumbers:
         """Of parts (P,), ascending, that are moved by one component after another."""
         number = np.full(int(parts.max(initial=-1)) + 2, -1, np.int32)
         number[parts] = np.arange(len(parts))
-        return cls(column, number)
+        return cls(column, number, axis)
 
-    def of_beams(self, part: np.ndarray) -> np.ndarray:
-        """Of the parts (N,) that beams meet; -1 where they meet none."""
-        return self.number[np.minimum(part, len(self.number) - 1)]
+    @cached_property
+    def components(self) -> np.ndarray:
+        """(P,) those of the unknown."""
+        return np.arange(int(self.number.max(initial=-1)) + 1)
+
+    def columns(self, name: str, part: np.ndarray, association: Association) -> Columns:
+        """How far beams find the surface along its normal, by the unknown of that name.
+
+        Args:
+            name: the unknown.
+            part: (N,) the part of the kind that each beam meets; -1 for none.
+            association: what they meet, with where in their regions.
+        """
+        index = self.number[np.minimum(part, len(self.number) - 1)]
+        along = np.ones(len(part)) if self.axis is None else association.from_middle_m[:, self.axis]
+        return Columns(name, index, along, self.components)
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ class _Seen:
     bases: Mapping[str, tuple[Site, np.ndarray | OneHot]]
     error: Mapping[Site, np.ndarray]
     shift_m: np.ndarray | float  # (N,) of the surfaces along their normals, by unknowns of theirs
-    cells: Sequence[tuple[str, np.ndarray, int]]  # those unknowns: (N,) component, number of them
+    cells: Sequence[Columns]  # by those unknowns, of that shift
 
     def error_at(self, site: Site, rows: np.ndarray) -> np.ndarray:
         """The error (R, D) at some rows."""
@@ -255,10 +255,10 @@ class ScanStop:
             ray = ray.turned(-error[Site.BEAM][:, 1], -error[Site.BEAM][:, 2])
             surface = self.meeting.meet(T, ray, values, association)
         cells = [
-            (name, cell.of_beams(self.parts(association, cell.column)), len(values[name]))
+            cell.columns(name, self.parts(association, cell.column), association)
             for name, cell in (self.cells if association.patches else {}).items()
         ]
-        shifts = (np.append(values[n], 0.0)[index] for n, index, _ in cells)
+        shifts = (np.append(values[c.variable], 0.0)[c.index] * c.value for c in cells)
         return _Seen(
             scan=scan,
             ray=ray,
@@ -354,8 +354,8 @@ class ScanStop:
         sparse += seen.surface.unknown(t)
         sparse = [replace(c, value=zero_at(lost, c.value)) for c in sparse]
         sparse += [
-            Columns(name, np.where(usable, index, -1), 1.0 / cosine, np.arange(size))
-            for name, index, size in seen.cells
+            replace(c, index=np.where(usable, c.index, -1), value=c.value / cosine)
+            for c in seen.cells
         ]
         return twist_derivative(seen.ray.origin_m, seen.ray.direction, t, slope), dense, sparse
 

@@ -28,10 +28,7 @@ PARALLEL_RAD = np.deg2rad(89.0)  # a choice: where it is 57 mm of range, nothing
 # Widths of the cells that surfaces are divided into, in a room whose box has 200 m2 of walls; in
 # larger ones the cells grow alike, so that there are never many more of them. Patches of planes are
 # as wide as the cells that planes are found in: within patches of 0.5 m the walls of the simulated
-# labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off. Errors
-# of a mesh that are smooth over a metre err together over 2 pi m2, and regions are too small for
-# that: in 40 labs of 24 stops it was turned by 1.32 of its sigmas (rms), and with regions of 2.5 m
-# by 1.10 (24 of them). But then fits to a mesh of wrong scale take 2.4 times as many passes.
+# labs are uneven enough for ring zeros of an XT32 to be 1.2 to 1.5 times their sigmas off.
 PATCHES_M = {REGION_PART: 1.2, PATCH: 0.5}
 PLANE_PATCHES_M = {REGION_PART: 1.2, PATCH: 0.3}
 ROOM_M2 = 200.0
@@ -126,7 +123,8 @@ class MeshSurface:
         part = self._kept(T, beams, part)
         met = _Met(T, beams, self.reference.planes, part)
         patches = {kind: self._patch(met, kind).astype(np.int32) for kind in self.patches_m}
-        return Association(part, patches)
+        away_m = self.reference.from_middle_m(met.part, met.point_m, self.patches_m[REGION_PART])
+        return Association(part, patches, away_m.astype(np.float32))
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
@@ -214,7 +212,11 @@ class PlaneSurface:
             kind: self._patch(met, size_m).astype(np.int32)
             for kind, size_m in self.patches_m.items()
         }
-        return Association(part, patches)
+        away_m = np.zeros((len(part), 2), np.float32)
+        hit = np.flatnonzero(met.part >= 0)
+        region_m = self.patches_m[REGION_PART]
+        away_m[hit] = self._grid.from_middle_m(met.part[hit], met.point_m[hit], region_m)
+        return Association(part, patches, away_m)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool

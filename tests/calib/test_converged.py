@@ -233,16 +233,24 @@ def test_weights_are_not_sought_for_long_where_rows_stay_hopeless(tmp_path, monk
     assert len(rounds) <= 3 * HOPEFUL
 
 
-def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, monkeypatch):
+@pytest.fixture
+def stops_short(monkeypatch):
+    """Fits that may take one pass at a time, and half of its step."""
+    moved = Descent.moved
+    monkeypatch.setattr("calib.solve.descent.MAX_PASSES", 1)
+    monkeypatch.setattr(Descent, "moved", lambda self, *a: moved(self, *a[:2], 0.5))
+
+
+def test_a_fit_that_is_not_at_its_optimum_is_not_called_converged(tiny, request):
     """Too few passes, and a step left that would lower the cost."""
     problem = build([Source.open(tiny)], Model())
     assert solve(problem).converged
-    monkeypatch.setattr("calib.solve.descent.MAX_PASSES", 1)
+    request.getfixturevalue("stops_short")
     assert not solve(problem).converged
 
 
-def test_python_refuses_too(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.solve.descent.MAX_PASSES", 1)
+@pytest.mark.usefixtures("stops_short")
+def test_python_refuses_too(tiny, tmp_path):
     run = calibrate([tiny], tmp_path / "run", hold_out="none")
     with pytest.raises(InputError, match="--force"):
         export(run, tmp_path / "out")
