@@ -90,6 +90,10 @@ class CellNumbers:
         """(P,) those of the unknown."""
         return np.arange(int(self.number.max(initial=-1)) + 1)
 
+    def of_beams(self, part: np.ndarray) -> np.ndarray:
+        """Of the parts (N,) that beams meet; -1 where they meet none."""
+        return self.number[np.minimum(part, len(self.number) - 1)]
+
     def columns(self, name: str, part: np.ndarray, association: Association) -> Columns:
         """How far beams find the surface along its normal, by the unknown of that name.
 
@@ -98,9 +102,8 @@ class CellNumbers:
             part: (N,) the part of the kind that each beam meets; -1 for none.
             association: what they meet, with where in their regions.
         """
-        index = self.number[np.minimum(part, len(self.number) - 1)]
         along = np.ones(len(part)) if self.axis is None else association.from_middle_m[:, self.axis]
-        return Columns(name, index, along, self.components)
+        return Columns(name, self.of_beams(part), along, self.components)
 
 
 @dataclass(frozen=True)

@@ -83,9 +83,7 @@ def bent(problem):
     values = rigs.shaken(problem.variables, problem.initial, 0.01)
     association = [s.associate(values, near_edges=False) for s in problem.scans]
     pairs = zip(problem.scans, association, strict=True)
-    views = [scan.rows(values, a).view for scan, a in pairs]
-    patches = ({kind: view[kind] for kind in ("region", "patch")} for view in views)
-    with_patches = [replace(a, patches=p) for a, p in zip(association, patches, strict=True)]
+    with_patches = [scan.settled(a.part, values) for scan, a in pairs]
     problem = with_surfaces(problem, with_patches)
     cells = {name: problem.variables[name] for name in problem.cells}
     values |= rigs.shaken(cells, problem.initial, 0.01)

@@ -62,6 +62,7 @@ class Dense:
         columns = {"origin": origin, "direction": direction, "range_m": range_m, "normal": normal}
         columns |= {"ring": read.ring, "point": a, "sigma": rows.sigma_m}
         columns |= {part: rows.view[part] for part in ("surface", "region", "patch")}
+        columns |= {"from_middle": association.from_middle_m}
         held = {name: column[kept] for name, column in columns.items()}
         return held | {"name": scan.name, "scale": rows.scale}
 
@@ -142,6 +143,9 @@ class Dense:
                 dofs = self.estimate.problem.variables[name].dofs
                 parts = [int(dof.split("_")[-1]) for dof in dofs]
                 off += values[name][:, np.searchsorted(parts, stop[column])]
+            for axis, along_m in enumerate(stop["from_middle"].T if column == "region" else ()):
+                if (tilt := f"{name}.tilt_{axis}") in values:
+                    off += values[tilt][:, np.searchsorted(parts, stop[column])] * along_m
         # A surface that stands off does so towards the sensor.
         wall = np.einsum("ki,ki->k", stop["normal"], stop["point"]) - off * np.sign(along)
         true_m = (wall - start) / along

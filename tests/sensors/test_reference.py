@@ -250,6 +250,26 @@ def test_patches_are_even_cells_of_one_surface(room):
     assert len(room.patch_surface(0.7)) == 2 * (6 * 4 + 6 * 4 + 4 * 4)
 
 
+def test_where_in_its_patch_a_beam_ends(room):
+    """Along two axes in the surface: patches' middles are 0, and steps there are steps along it."""
+    hits = room.cast(STATION_M, random_directions(20000))
+    triangle, patch = hits.triangle, room.patch(hits.triangle, hits.point_m, 0.5)
+    away_m = room.from_middle_m(triangle, hits.point_m, 0.5)
+    assert np.abs(away_m).max() <= 0.25 + 1e-9 and np.abs(away_m).max() > 0.24
+    low, high = np.full((patch.max() + 1, 3), np.inf), np.full((patch.max() + 1, 3), -np.inf)
+    np.minimum.at(low, patch, hits.point_m)
+    np.maximum.at(high, patch, hits.point_m)
+    middle_m = (low + high)[patch] / 2
+    whole = (high - low)[patch].sum(axis=1) > 0.9  # of many beams
+    off_m = np.linalg.norm(away_m, axis=1) - np.linalg.norm(hits.point_m - middle_m, axis=1)
+    assert np.abs(off_m[whole]).max() < 0.05 and whole.sum() > 5000
+    order = np.argsort(patch)
+    first, second = (each[np.diff(patch[order]) == 0] for each in (order[:-1], order[1:]))
+    apart_m = np.linalg.norm(hits.point_m[first] - hits.point_m[second], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(away_m[first] - away_m[second], axis=1), apart_m)
+    assert not room.from_middle_m(np.full(1, -1), np.full((1, 3), np.inf), 0.5).any()
+
+
 def curtain(wave_m=0.03, noise_m=0.0, steps=30):
     """A sheet of 2 m with five waves across it."""
     vertices, triangles = sheet([0, 0, 0], [2, 0, 0], [0, 0, 2], steps)

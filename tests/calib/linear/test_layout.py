@@ -14,6 +14,7 @@ from .. import rigs, simulated
 
 NO_NOISE = {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end", "sigma_joint_rad": 0}
 CELLS = ("0/reference_surface", "0/reference_region", "0/reference_patch")
+TILTS = ("0/reference_region.tilt_0", "0/reference_region.tilt_1")
 JOINTS = tuple(f"joints@s{k}" for k in range(4))
 
 
@@ -89,8 +90,8 @@ def test_of_a_meshs_cells_those_that_are_most_are_the_finest(problem):
     sizes = [found.variables[name].dim for name in CELLS]
     assert sizes == sorted(sizes) and sizes[0] == 6 < sizes[1] < sizes[2]
     assert names_at(layout, layout.finest) == {CELLS[2]}
-    assert names_at(layout, layout.cells) == set(CELLS[:2])
-    assert not set(CELLS) & set(layout.outer())
+    assert names_at(layout, layout.cells) == {*CELLS[:2], *TILTS}
+    assert not {*CELLS, *TILTS} & set(layout.outer())
 
 
 def test_of_several_meshes_each_has_its_finest_and_of_one_mesh_only_one(tmp_path):
