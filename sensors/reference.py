@@ -243,6 +243,10 @@ class Reference:
         away_m[hit] = self._grid.from_middle_m(surface, point_m[hit], size_m)
         return away_m
 
+    def widths_m(self, size_m: float) -> np.ndarray:
+        """How wide (S, 2) the patches of that size are on each surface, along the same axes."""
+        return self._grid.widths_m(size_m)
+
     def facts(self, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Label, intensity and surface (N,) of triangles (N,); -1, NaN and -1 of triangle -1."""
         surface = np.where(triangle >= 0, self.surface[triangle], -1)

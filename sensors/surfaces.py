@@ -100,7 +100,11 @@ class SurfaceGrid:
         along the axes of its surface."""
         cells = self._cells(cell_m)
         steps, at = self._steps(surface, point_m, cells)
-        return (steps - at - 0.5) * (self.size_m / cells).take(surface, axis=0)
+        return (steps - at - 0.5) * self.widths_m(cell_m).take(surface, axis=0)
+
+    def widths_m(self, cell_m: float) -> np.ndarray:
+        """How wide (S, 2) the patches of each surface are along its axes."""
+        return self.size_m / self._cells(cell_m)
 
     def patches(self, cell_m: float) -> np.ndarray:
         """How many patches (S,) each surface has."""

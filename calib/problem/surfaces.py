@@ -27,9 +27,10 @@ LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its be
 # for each metre that one stands off. Chosen by how far errors smooth over 0.4, 1 and 2 m turn the
 # mesh of a lab, in its sigmas: 0.8, 1.0 and 1.3; without tilts, and with shares of 0.6, 0.6 and 2,
 # by 1.3, 1.4 and 1.7. Over 24 labs of 24 stops rotations were 0.98 of their sigmas off (rms), and
-# 1.30 without tilts; ring zeros of an XT32, over 12, 1.17 and 1.40.
+# 1.30 without tilts; ring zeros of an XT32, over 12, 1.17 and 1.40. What is no wider than a patch
+# has no tilt of its own.
 SURFACE_SHARES = {"surface": 0.6, "region": 1.0, "patch": 0.5}
-TILT_PER_M, TILT_AXES = np.sqrt(2.0), (0, 1)
+TILT_PER_M = np.sqrt(2.0)
 
 
 def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Problem:
@@ -53,20 +54,17 @@ def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Prob
             if not len(parts):
                 continue  # no beam meets the room: there is nothing to estimate
             name = kind if on_planes else f"{room}/reference_{column}"
-            sigma_m = cell_sigma_m(first, column)
-            unknowns.append(_unknown(name, room, column, parts, sigma_m))
-            cells[name] = SurfaceCells(
+            whole = SurfaceCells(
                 column=column,
                 kind=kind,
                 parts=parts,
                 surface=first.meeting.surface_of(column, parts),
                 room=room,
             )
-            for axis in TILT_AXES if column == REGION_PART else ():
-                tilt = f"{name}.tilt_{axis}"
-                cells[tilt] = replace(cells[name], axis=axis)
-                sigma = scatter(cells[tilt], sigma_m)
-                unknowns.append(_unknown(tilt, room, column, parts, sigma, "rad"))
+            some = {name: whole} | (_tilts(name, whole, first) if column == REGION_PART else {})
+            sigma_m = cell_sigma_m(first, column)
+            unknowns += [_unknown(n, each, scatter(each, sigma_m)) for n, each in some.items()]
+            cells |= some
     return problem.with_cells(unknowns, cells)
 
 
@@ -116,21 +114,26 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
     return found
 
 
-def _unknown(
-    name: str,
-    room: int | str,
-    column: str,
-    parts: np.ndarray,
-    sigma: float,
-    unit: str = "m",
-) -> Unknown:
+def _tilts(name: str, regions: SurfaceCells, scan: ScanStop) -> dict[str, SurfaceCells]:
+    """Tilts of the regions that are wide enough for one, by unknown; `scan` is one that meets the
+    room."""
+    found = {}
+    for axis, wide in enumerate(scan.meeting.tilting(regions.parts).T):
+        if wide.any():
+            parts, surface = regions.parts[wide], regions.surface[wide]
+            tilts = replace(regions, parts=parts, surface=surface, axis=axis)
+            found[f"{name}.tilt_{axis}"] = tilts
+    return found
+
+
+def _unknown(name: str, cells: SurfaceCells, sigma: float) -> Unknown:
     return vector_unknown(
         name,
-        np.full(len(parts), sigma),
-        dofs=(f"{column}_{part}" for part in parts),
-        units=(unit,) * len(parts),
+        np.full(len(cells.parts), sigma),
+        dofs=(f"{cells.column}_{part}" for part in cells.parts),
+        units=("m" if cells.axis is None else "rad",) * len(cells.parts),
         role=Role.SURFACE,
-        owner=Owner(room=room),
+        owner=Owner(room=cells.room),
     )
 
 

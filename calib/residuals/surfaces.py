@@ -45,6 +45,8 @@ class Meeting(Protocol):
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
+    def tilting(self, regions: np.ndarray) -> np.ndarray: ...
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
 
     def associate(
@@ -92,6 +94,11 @@ class MeshSurface:
         if kind == SURFACE:
             return parts
         return self.reference.patch_surface(self.patches_m[kind], kind == PATCH)[parts]
+
+    def tilting(self, regions: np.ndarray) -> np.ndarray:
+        """Which regions (R, 2) are wider than a patch, along each axis of their surface."""
+        widths_m = self.reference.widths_m(self.patches_m[REGION_PART])
+        return widths_m[self.surface_of(REGION_PART, regions)] > self.patches_m[PATCH]
 
     def surfaces(self, association: Association) -> np.ndarray:
         """The surface (N,) that each beam meets, -1 for none."""
@@ -204,6 +211,11 @@ class PlaneSurface:
     def surface_of(self, kind: str, parts: np.ndarray) -> np.ndarray:
         """The plane that each of those parts is of."""
         return self._grid.patch_surface(self.patches_m[kind])[parts]
+
+    def tilting(self, regions: np.ndarray) -> np.ndarray:
+        """Which regions (R, 2) are wider than a patch, along each axis of their plane."""
+        widths_m = self._grid.widths_m(self.patches_m[REGION_PART])
+        return widths_m[self.surface_of(REGION_PART, regions)] > self.patches_m[PATCH]
 
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
         """The planes (N,) that beams meet from there, and the patches of them."""

@@ -270,6 +270,26 @@ def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fi
     assert targets == [9] * len(fitted.problem.sources[0].recording.targets.names)
 
 
+def test_what_is_no_wider_than_a_patch_has_no_tilt(fitted):
+    """By the extent of each surface's corners along their principal axes."""
+    mesh, cells = fitted.scans[0].meeting.reference, fitted.problem.cells.values()
+    tilted = [set(each.surface.tolist()) for each in cells if each.axis is not None]
+    (met,) = (each.surface for each in cells if each.column == "surface")
+    small = large = 0
+    for surface in met.tolist():
+        corners_m = mesh.vertices_m[mesh.triangles[mesh.surface == surface]].reshape(-1, 3)
+        away_m = corners_m - corners_m.mean(axis=0)
+        long_m, wide_m, _ = np.ptp(away_m @ np.linalg.svd(away_m)[2].T, axis=0)
+        tilts = [surface in some for some in tilted]
+        if long_m < 0.45:
+            small += 1
+            assert not any(tilts)
+        elif wide_m > 0.75:
+            large += 1
+            assert all(tilts)
+    assert len(tilted) == 2 and small > 1 and large > 5
+
+
 def test_a_ring_without_returns_is_as_well_known_as_before(tmp_path):
     """No row touches its zero; what is rounding there is not divided by."""
     made(tmp_path / "rec", SMALL, 4)
