@@ -4,7 +4,8 @@ Mesh error is smooth over whole surfaces, so a fit carries one displacement alon
 surface, per region and per patch: without them neighbouring points would count as independent
 facts. Regions are tilted, too: an error that is smooth has slopes, and many beams within a patch
 would take those of a floor for a tilt of the whole room. Walls are no flatter: planes found in the
-scans have regions and patches as well. Where a plane is as a whole is itself estimated.
+scans have regions and patches as well. These have no tilts: with them a fit to one still hold of an
+XT32 went astray. Where a plane is as a whole is itself estimated.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.beams import Association
 from calib.residuals.groups import REGION_PART
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import PLANE_PATCHES_M, PlaneSurface
+from calib.residuals.surfaces import PLANE_PATCHES_M, MeshSurface, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its beams
@@ -61,7 +62,9 @@ def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Prob
                 surface=first.meeting.surface_of(column, parts),
                 room=room,
             )
-            some = {name: whole} | (_tilts(name, whole, first) if column == REGION_PART else {})
+            some = {name: whole}
+            if column == REGION_PART and isinstance(first.meeting, MeshSurface):
+                some |= _tilts(name, whole, first.meeting)
             sigma_m = cell_sigma_m(first, column)
             unknowns += [_unknown(n, each, scatter(each, sigma_m)) for n, each in some.items()]
             cells |= some
@@ -114,11 +117,10 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
     return found
 
 
-def _tilts(name: str, regions: SurfaceCells, scan: ScanStop) -> dict[str, SurfaceCells]:
-    """Tilts of the regions that are wide enough for one, by unknown; `scan` is one that meets the
-    room."""
+def _tilts(name: str, regions: SurfaceCells, mesh: MeshSurface) -> dict[str, SurfaceCells]:
+    """Tilts of the regions that are wide enough for one, by unknown."""
     found = {}
-    for axis, wide in enumerate(scan.meeting.tilting(regions.parts).T):
+    for axis, wide in enumerate(mesh.tilting(regions.parts).T):
         if wide.any():
             parts, surface = regions.parts[wide], regions.surface[wide]
             tilts = replace(regions, parts=parts, surface=surface, axis=axis)

@@ -49,7 +49,7 @@ class Association:
         part: (N,) triangle or plane; -1 for nothing.
         patches: kind of patch -> (N,) patch of the surface, -1 for none; empty if not kept.
         from_middle_m: (N, 2) where in its region each beam ends, along two axes of the surface;
-            None if not kept.
+            None if not kept, and on planes.
     """
 
     part: np.ndarray

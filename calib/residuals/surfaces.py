@@ -45,8 +45,6 @@ class Meeting(Protocol):
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
-    def tilting(self, regions: np.ndarray) -> np.ndarray: ...
-
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
 
     def associate(
@@ -212,11 +210,6 @@ class PlaneSurface:
         """The plane that each of those parts is of."""
         return self._grid.patch_surface(self.patches_m[kind])[parts]
 
-    def tilting(self, regions: np.ndarray) -> np.ndarray:
-        """Which regions (R, 2) are wider than a patch, along each axis of their plane."""
-        widths_m = self._grid.widths_m(self.patches_m[REGION_PART])
-        return widths_m[self.surface_of(REGION_PART, regions)] > self.patches_m[PATCH]
-
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
         """The planes (N,) that beams meet from there, and the patches of them."""
         met = _Met(T, beams, _and_none(self.planes.normal, self.planes.distance_m), part)
@@ -224,11 +217,7 @@ class PlaneSurface:
             kind: self._patch(met, size_m).astype(np.int32)
             for kind, size_m in self.patches_m.items()
         }
-        away_m = np.zeros((len(part), 2), np.float32)
-        hit = np.flatnonzero(met.part >= 0)
-        region_m = self.patches_m[REGION_PART]
-        away_m[hit] = self._grid.from_middle_m(met.part[hit], met.point_m[hit], region_m)
-        return Association(part, patches, away_m)
+        return Association(part, patches)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool

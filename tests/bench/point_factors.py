@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from workload import Values, Work
 
-from calib.residuals.beams import Rows
+from calib.residuals.beams import Association, Rows
 from calib.residuals.scan import ScanStop
 from calib.solve.graph import Graph
 from sensors.lidar import beams
@@ -54,7 +54,7 @@ class PointFactors:
         keys = [self.rest._key[name] for name in chain]
         own = np.column_stack([self.keys[c.variable][c.components[c.index]] for c in rows.sparse])
         known = np.column_stack([c.index >= 0 for c in rows.sparse])
-        make = _given if self.given else _computed
+        make = _given if self.given else partial(_computed, self.work.associations[i])
         callbacks = make(rows, scan, placed.T[0], list(chain.values()), known)
         noise = gtsam.noiseModel.Unit.Create(1)
         for mine, there, callback in zip(own, known, callbacks, strict=True):
@@ -93,26 +93,38 @@ def _hand_over(residual, row, factor, values, jacobians):
 
 
 def _computed(
-    rows: Rows, scan: ScanStop, T: np.ndarray, chain: list[np.ndarray], known: np.ndarray
+    met: Association,
+    rows: Rows,
+    scan: ScanStop,
+    T: np.ndarray,
+    chain: list[np.ndarray],
+    known: np.ndarray,
 ) -> Iterator[Callable]:
     root = np.sqrt(rows.weight) / rows.sigma_m
     ray = beams(scan.recording.scan(scan.index).xyz_m, scan.lidar.beam_origin_m)
     normal, point = rows.view["normal"], np.where(rows.usable[:, None], rows.view["point_m"], 0)
     ring = np.array([c.variable == RINGS for c in rows.sparse])
+    away_m = np.ones(
+        (len(root), len(ring))
+    )  # what a unit of each moves the surface by, at its point
+    for k, column in enumerate(rows.sparse):
+        if not ring[k] and (axis := scan.cells[column.variable].axis) is not None:
+            away_m[:, k] = met.from_middle_m[:, axis]
     for n in range(len(root)):
         beam = ray.origin_m[n], ray.direction[n], ray.range_m[n]
         plane = normal[n], normal[n] @ point[n]
-        yield partial(_compute, T, chain, ring[known[n]], beam, *plane, root[n])
+        mine = ring[known[n]], away_m[n, known[n]]
+        yield partial(_compute, T, chain, *mine, beam, *plane, root[n])
 
 
-def _compute(T, chain, ring, beam, normal, distance, root, factor, values, jacobians):
+def _compute(T, chain, ring, away_m, beam, normal, distance, root, factor, values, jacobians):
     if root == 0.0:
         normal = -T[:3, :3] @ beam[1]
     origin, direction, range_m = beam
     n = normal @ T[:3, :3]
     along = n @ direction
     t = (distance - normal @ T[:3, 3] - n @ origin) / along
-    own = np.where(ring, -1.0, 1.0 / abs(along))  # a ring's offset, or a shift along the normal
+    own = np.where(ring, -1.0, away_m / abs(along))  # a ring's offset, or along the normal
     shift = own @ [values.atVector(key)[0] for key in factor.keys()[len(chain) :]]
     n = n / along
     if jacobians is not None:

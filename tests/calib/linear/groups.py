@@ -126,6 +126,8 @@ class Groups:
             yield Group("joints", stop, "joints", recording), every
             yield from ((Group("joints", stop, dof, recording), [k]) for k, dof in each)
         elif (cells := self.problem.cells.get(name)) and isinstance(cells.room, int):  # a mesh
+            if cells.axis is not None:
+                return  # a tilt goes with no group
             single = np.bincount(cells.surface)[cells.surface] < 2  # that surface is its only patch
             for k, _ in each:
                 what = f"{cells.column}_{cells.parts[k]}"
