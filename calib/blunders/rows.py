@@ -17,11 +17,13 @@ from calib.problem.problem import Block, Problem
 from calib.problem.unknowns import Role
 from calib.problem.without import ROD, of_the_arm
 from calib.residuals.groups import (
+    ABOUT_AXES,
     ALONG_BEAMS,
     ALONG_NORMAL,
     CAD,
     JOINTS,
     MESH,
+    REGION_PART,
     SURFACE,
     Group,
     part_of_mesh,
@@ -204,28 +206,47 @@ def _paper(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
 
 
 def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
-    """Surfaces of the mesh, and parts of them: a wall that has moved, and one that is warped. The
-    only region of a surface, or its only patch, is that surface."""
+    """Surfaces of the mesh, and parts of them: a wall that has moved, and one that is warped or
+    turned. The only region of a surface, or its only patch, is that surface."""
+    layout, tilts = whole.layout, _tilts(problem)
+    columns = {name: layout.columns([name]) for name in problem.cells}
     for name, cells in problem.cells.items():
         if not cells.of_mesh or cells.axis is not None:
             continue
-        unknown, columns = whole.layout.unknowns[name], whole.layout.columns([name])
         alone = np.bincount(cells.surface)[cells.surface] == 1
-        off = whole.values[name] - unknown.mean
         for k, part in enumerate(cells.parts.tolist()):
             if cells.column != SURFACE and alone[k]:
                 continue
-            sigma = unknown.sigma[k : k + 1]
+            mine = {(name, k): ALONG_NORMAL} | tilts.get((cells.room, cells.column, part), {})
+            unknowns = [layout.unknowns[n] for n, _ in mine]
+            sigma = np.array([u.sigma[i] for u, (_, i) in zip(unknowns, mine, strict=True)])
+            off = np.array([whole.values[n][i] for n, i in mine])
             yield GroupRows(
-                A=1.0 / sigma[:, None],
-                columns=columns[k : k + 1],
-                b=-off[k : k + 1] / sigma,
-                weight=np.full(1, unknown.weight),
+                A=np.diag(1.0 / sigma),
+                columns=np.array([columns[n][i] for n, i in mine]),
+                b=-off / sigma,
+                weight=np.array([u.weight for u in unknowns]),
                 sigma=-sigma,
-                axes=[ALONG_NORMAL],
-                units=["m"],
-                groups={Group("surface", MESH, part_of_mesh(cells.column, part)): np.eye(1)},
+                axes=list(mine.values()),
+                units=[u.units[i] for u, (_, i) in zip(unknowns, mine, strict=True)],
+                groups={Group("surface", MESH, part_of_mesh(cells.column, part)): np.eye(len(off))},
             )
+
+
+def _tilts(problem: Problem) -> dict[tuple[object, str, int], dict[tuple[str, int], str]]:
+    """Room, kind and number of a region, or of a surface that is one region -> the components of
+    unknowns that tilt it, and what such a tilt is called."""
+    whole = (c for c in problem.cells.values() if c.column == REGION_PART and c.axis is None)
+    regions = {cells.room: np.bincount(cells.surface) for cells in whole}
+    found: dict[tuple[object, str, int], dict[tuple[str, int], str]] = {}
+    for name, cells in problem.cells.items():
+        if cells.axis is None:
+            continue
+        for k, (part, surface) in enumerate(zip(cells.parts, cells.surface, strict=True)):
+            one = regions[cells.room][surface] == 1
+            of = (SURFACE, int(surface)) if one else (REGION_PART, int(part))
+            found.setdefault((cells.room, *of), {})[name, k] = ABOUT_AXES[cells.axis]
+    return found
 
 
 def _joints(

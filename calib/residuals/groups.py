@@ -13,6 +13,7 @@ CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
 SURFACE, REGION_PART, PATCH = MESH_PARTS = "surface", "region", "patch"
 ALONG_BEAMS = "along the beams"  # the direction of a range zero
 ALONG_NORMAL = "along its normal"  # that of a part of the mesh
+ABOUT_AXES = "about its first axis", "about its second axis"  # how that is tilted, along either
 
 
 def part_of_mesh(kind: str, number: int) -> str:

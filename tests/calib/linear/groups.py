@@ -75,6 +75,9 @@ class Groups:
                 if group.where in full:
                     self.scale[rows] = 1 / np.sqrt(unknown.weight)
                 self.parts[group] = Part(rows[k], np.eye(len(k)), np.diag(sigma))
+        for name, cells in self.problem.cells.items():
+            if cells.axis is not None:
+                self._tilted(self._rows(f"prior:{name}"), name, cells)
         for i, scan in enumerate(self.problem.scans):
             recording = scan.recording.folder.name if self.several else ""
             self.scans[Group("scan", scan.name, "scan", recording)] = i
@@ -113,6 +116,17 @@ class Groups:
             self.parts[whole] = Part(
                 rows, _diagonal(p.D for p in every), _diagonal(p.told for p in every)
             )
+
+    def _tilted(self, rows: np.ndarray, name: str, cells: object) -> None:
+        """Tilts are with their region, or with the surface that is that region alone."""
+        sigma = self.problem.variables[name].sigma
+        for k, row in enumerate(rows):
+            region = Group("surface", "mesh", f"region_{cells.parts[k]}")
+            surface = Group("surface", "mesh", f"surface_{cells.surface[k]}")
+            group = region if region in self.parts else surface
+            found = self.parts[group]
+            told = np.diag([*np.diag(found.told), sigma[k]])
+            self.parts[group] = Part(np.append(found.rows, row), np.eye(len(told)), told)
 
     def _on_paper(self, name: str, unknown: object) -> Iterator[tuple[Group, list[int]]]:
         """Groups of a prior's rows."""
