@@ -51,13 +51,14 @@ def bulged(tmp_path_factory):
 
 @pytest.mark.long
 def test_a_bulge_is_named_where_it_is(bulged):
-    """By 20 mm, over a metre of a wall of several metres; and not as that wall."""
+    """By 20 mm, over a metre of a wall of several metres; and not as that wall. Regions are tilted
+    at its flanks."""
     folder, moved_m, run = bulged
     found, source = diagnose(run, refits=False), Source.open(folder)
     assert found.verdict == "bad_data" and found.worth_adding == []
     tokens = [blunder["without"] for blunder in found.blunders]
     assert tokens and all(t.startswith(("mesh:patch_", "mesh:region_")) for t in tokens)
-    worst = max(found.blunders, key=lambda b: b["size"])
+    worst = max((b for b in found.blunders if b["unit"] == "m"), key=lambda b: b["size"])
     top_m = source.reference.vertices_m[np.argmax(moved_m)]
     assert np.linalg.norm(part_centre_m(source.reference, worst["name"]) - top_m) < 0.8
     assert 5 * worst["sigma"] < worst["size"] < moved_m.max()  # its mean over that part
@@ -73,6 +74,43 @@ def test_without_it_nothing_is_wrong(bulged, tmp_path):
     assert diagnose(less, refits=False).verdict == "adequate"
     lost = run.summary["points"] - less.summary["points"]
     assert 0 < lost < 0.2 * run.summary["points"]
+
+
+@pytest.mark.long
+def test_a_board_that_is_turned_about_its_middle_is_named_by_its_angle(bulged, tmp_path):
+    """20 mrad of a face as wide as one region, most beams' among such: its middle is where it was,
+    so no part of it stands off as a whole."""
+    simulate(SPEC, tmp_path / "rec", 3, {})
+    table = sorted((bulged[2].folder / "residuals.parquet").glob("L*.parquet"))
+    met = np.concatenate([read_table(each)["surface"] for each in table]).astype(int)
+    mesh = Source.open(tmp_path / "rec").reference
+    regions = np.bincount(mesh.patch_surface(patch_widths_m(mesh)["region"]))
+    sides_m = np.sort(np.stack([_sides_m(mesh, s) for s in range(len(regions))]), axis=1)
+    board = (regions == 1) & (sides_m[:, 1] > 0.8)
+    face = int(np.argmax(np.where(board, np.bincount(met[met >= 0], minlength=len(board)), 0)))
+    corners = np.unique(mesh.triangles[mesh.surface == face])
+    middle_m = mesh.vertices_m[corners].mean(axis=0)
+    _, _, (along, _, normal) = np.linalg.svd(mesh.vertices_m[corners] - middle_m)
+
+    def turned(vertices_m, triangles):
+        away_m = vertices_m[corners] - middle_m
+        vertices_m[corners] += 0.02 * (away_m @ along)[:, None] * normal
+        return vertices_m
+
+    Scene(tmp_path / "rec", np.random.default_rng(0)).remesh(turned)
+    run = calibrate([tmp_path / "rec"], tmp_path / "run", Model(), "none")
+    found = diagnose(run, refits=False)
+    (said,) = found.blunders
+    assert found.verdict == "bad_data" and said["without"] == f"mesh:surface_{face}"
+    assert said["unit"] == "rad" and "about its" in said["sentence"]
+    assert abs(said["size"] - 0.02) < 4 * said["sigma"] < 0.008
+
+
+def _sides_m(mesh: Reference, surface: int) -> np.ndarray:
+    """Extents (3,) of a surface along its principal axes."""
+    corners_m = mesh.vertices_m[mesh.triangles[mesh.surface == surface]].reshape(-1, 3)
+    away_m = corners_m - corners_m.mean(axis=0)
+    return np.ptp(away_m @ np.linalg.svd(away_m)[2].T, axis=0)
 
 
 def test_the_middle_of_a_patch_is_in_it(bulged):
