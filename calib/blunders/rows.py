@@ -209,7 +209,8 @@ def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
     """Surfaces of the mesh, and parts of them: a wall that has moved, and one that is warped or
     turned. The only region of a surface, or its only patch, is that surface."""
     layout, tilts = whole.layout, _tilts(problem)
-    columns = {name: layout.columns([name]) for name in problem.cells}
+    known = {name: layout.unknowns[name] for name in problem.cells}
+    columns = {name: layout.columns([name]) for name in known}
     for name, cells in problem.cells.items():
         if not cells.of_mesh or cells.axis is not None:
             continue
@@ -218,17 +219,16 @@ def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
             if cells.column != SURFACE and alone[k]:
                 continue
             mine = {(name, k): ALONG_NORMAL} | tilts.get((cells.room, cells.column, part), {})
-            unknowns = [layout.unknowns[n] for n, _ in mine]
-            sigma = np.array([u.sigma[i] for u, (_, i) in zip(unknowns, mine, strict=True)])
+            sigma = np.array([known[n].sigma[i] for n, i in mine])
             off = np.array([whole.values[n][i] for n, i in mine])
             yield GroupRows(
                 A=np.diag(1.0 / sigma),
                 columns=np.array([columns[n][i] for n, i in mine]),
                 b=-off / sigma,
-                weight=np.array([u.weight for u in unknowns]),
+                weight=np.array([known[n].weight for n, _ in mine]),
                 sigma=-sigma,
                 axes=list(mine.values()),
-                units=[u.units[i] for u, (_, i) in zip(unknowns, mine, strict=True)],
+                units=[known[n].units[i] for n, i in mine],
                 groups={Group("surface", MESH, part_of_mesh(cells.column, part)): np.eye(len(off))},
             )
 

@@ -2,10 +2,10 @@
 
 Mesh error is smooth over whole surfaces, so a fit carries one displacement along the normal per
 surface, per region and per patch: without them neighbouring points would count as independent
-facts. Regions are tilted, too: an error that is smooth has slopes, and many beams within a patch
-would take those of a floor for a tilt of the whole room. Walls are no flatter: planes found in the
-scans have regions and patches as well. These have no tilts: with them a fit to one still hold of an
-XT32 went astray. Where a plane is as a whole is itself estimated.
+facts. Regions are tilted, too: an error that is smooth has slopes, and without tilts of regions the
+slope of a floor, which many beams show, would count as a tilt of the whole room. Walls are no
+flatter: planes found in the scans have regions and patches as well. These have no tilts: with them
+a fit to one still hold of an XT32 went astray. Where a plane is as a whole is itself estimated.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from calib.residuals.surfaces import PLANE_PATCHES_M, MeshSurface, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its beams
-# Variance of the displacements, as shares of the reference's; and how much a region is tilted, rad,
-# for each metre that one stands off. Chosen by how far errors smooth over 0.4, 1 and 2 m turn the
+# Variance of the displacements, as shares of the reference's; and by how much regions tilt, rad,
+# for each metre that they stand off. Chosen by how far errors smooth over 0.4, 1 and 2 m turn the
 # mesh of a lab, in its sigmas: 0.8, 1.0 and 1.3; without tilts, and with shares of 0.6, 0.6 and 2,
 # by 1.3, 1.4 and 1.7. Over 24 labs of 24 stops rotations were 0.98 of their sigmas off (rms), and
 # 1.30 without tilts; ring zeros of an XT32, over 12, 1.17 and 1.40. What is no wider than a patch

@@ -13,7 +13,8 @@ CAD, MESH = "cad", "mesh"  # where, of what belongs to no stop and no target
 SURFACE, REGION_PART, PATCH = MESH_PARTS = "surface", "region", "patch"
 ALONG_BEAMS = "along the beams"  # the direction of a range zero
 ALONG_NORMAL = "along its normal"  # that of a part of the mesh
-ABOUT_AXES = "about its first axis", "about its second axis"  # how that is tilted, along either
+# Its tilts: what stands off the more, the further along its first axis, is turned about its second.
+ABOUT_AXES = "about its second axis", "about its first axis"
 
 
 def part_of_mesh(kind: str, number: int) -> str:

@@ -87,8 +87,8 @@ def test_held_out_error_is_the_noise_floor(rigs: list) -> None:
 
 
 def test_a_mesh_that_is_off_smoothly_turns_the_alignment_as_its_sigma_says(once: Once) -> None:
-    """The rotations of 24 labs are 1.0 of their sigmas off (rms of 72), give or take two of 0.083,
-    which chance leaves; they were 1.30 where regions of the mesh had no tilt."""
+    """The rotations of 24 labs are 1.0 of their sigmas off (rms of 72), give or take twice the
+    0.083 that chance leaves; they were 1.30 where regions of the mesh had no tilt."""
     z = []
     for seed in range(11, 35):
         folder = once(lab, seed)

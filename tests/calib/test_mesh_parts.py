@@ -78,8 +78,8 @@ def test_without_it_nothing_is_wrong(bulged, tmp_path):
 
 @pytest.mark.long
 def test_a_board_that_is_turned_about_its_middle_is_named_by_its_angle(bulged, tmp_path):
-    """20 mrad of a face as wide as one region, most beams' among such: its middle is where it was,
-    so no part of it stands off as a whole."""
+    """The face that most beams meet, of those that are one region, is turned by 20 mrad. Its middle
+    is where it was, so it does not stand off as a whole."""
     simulate(SPEC, tmp_path / "rec", 3, {})
     table = sorted((bulged[2].folder / "residuals.parquet").glob("L*.parquet"))
     met = np.concatenate([read_table(each)["surface"] for each in table]).astype(int)
