@@ -67,7 +67,7 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     parts = moved(counts, ~_any(counts, known)) if enough else []
     elsewhere = _any(counts, [some for _, some in parts])
     every = [(mine, place) for mine, place in every if elsewhere[mine].mean() <= MOSTLY_ELSEWHERE]
-    said = [mine for mine, place in every if place.structured or place.in_the_way]
+    said = [mine for mine, place in every if place.structured or place.harmless]
     places = [place for _, place in every]
     total = int(counts.met.sum())
     rest = counts.rejected[~_any(counts, [mine for mine, _ in every]) & ~elsewhere]
@@ -265,7 +265,7 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
     rejected, total, beams = counts.rejected[inside], view.rows.sum(), view.rows[cells].sum()
     lower, upper = view.axis.interval(cells)
     parts = view.axis.name in MESH_PARTS and counts.place_names
-    along = rejected.steadier if parts else ALONG_BEAMS
+    along = rejected.steadier if view.axis.name in MESH_PARTS else ALONG_BEAMS
     steady, share = rejected.along(along), len(rejected) / max(beams, 1)
     return Place(
         covariate=view.axis.name,
@@ -281,6 +281,7 @@ def _place(view: _View, counts: Counts, cells: np.ndarray, inside: np.ndarray, p
         coherent=rejected.coherent or bool(parts and share > WHOLE_SHARE and steady.coherent),
         short=rejected.short,
         along=along,
+        meshed=bool(counts.place_names),
     )
 
 

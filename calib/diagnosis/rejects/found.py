@@ -13,7 +13,13 @@ from calib.diagnosis.rejects.moved import MOST_NAMED, MovedPart
 from calib.diagnosis.rejects.rejected import MOSTLY_SHORT
 from calib.diagnosis.suggest import words
 from calib.problem.model import Source
-from calib.residuals.groups import ALONG_BEAMS, ALONG_NORMAL, MESH_PARTS, part_of_mesh
+from calib.residuals.groups import (
+    ALONG_BEAMS,
+    ALONG_NORMAL,
+    MESH_PARTS,
+    SURFACE,
+    part_of_mesh,
+)
 from calib.rig.suspect import listed
 
 # Parts of the mesh, where more of which seem to have moved the rig may have: choices. Of two
@@ -54,6 +60,7 @@ class Place:
         coherent: whether most would not be rejected were their median taken off, and not as well
             with the other sign.
         short: share of the rejected that reads short.
+        meshed: whether surfaces are those of a mesh, and not planes found in the scans.
     """
 
     covariate: str
@@ -69,12 +76,13 @@ class Place:
     coherent: bool
     short: float
     along: str = ALONG_BEAMS
+    meshed: bool = True
 
     @property
     def structured(self) -> bool:
         """Whether neither mixed pixels nor things that stand in the way explain it."""
-        odd = self.coherent or (self.share > STRUCTURED_SHARE and not self.in_the_way)
-        return odd and self.share > CLUTTER
+        odd = self.coherent or self.share > STRUCTURED_SHARE
+        return odd and self.share > CLUTTER and not self.harmless
 
     @property
     def of_mesh(self) -> bool:
@@ -85,6 +93,18 @@ class Place:
     def in_the_way(self) -> bool:
         """Whether its beams hit something nearer than the mesh, at all distances."""
         return not self.coherent and self.short > MOSTLY_SHORT
+
+    @property
+    def beside_a_plane(self) -> bool:
+        """Whether it is the lesser part of the beams near a plane found in the scans, and all of
+        them end as far from it: on a board before a wall, as nothing says that there is none."""
+        plane = self.covariate == SURFACE and not self.meshed
+        return plane and self.coherent and self.share <= STRUCTURED_SHARE
+
+    @property
+    def harmless(self) -> bool:
+        """Whether things explain it that nothing says are not there."""
+        return self.in_the_way or self.beside_a_plane
 
     @property
     def where(self) -> str:
@@ -102,6 +122,9 @@ class Place:
     @property
     def what(self) -> str:
         """In words, what becomes of its beams."""
+        if self.beside_a_plane:
+            side = "before" if self.residual_m < 0 else "behind"
+            return f"they end on another surface, {self.size} mm {side} that plane"
         if self.coherent and self.along == ALONG_NORMAL:
             return f"they end {self.size} mm {'before' if self.residual_m < 0 else 'behind'} it"
         if self.coherent:

@@ -19,14 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from calib.diagnosis.score import projection
+from calib.diagnosis.score import away_from_model, projection
 from calib.diagnosis.screen import Candidate, Screen
 from calib.diagnosis.search import NamedEffect, Search
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import in_words
-from calib.effects import Site
+from calib.effects import Effect, Site
 from calib.results.errors import Errors
 from calib.results.holdout import TAKEN_BACK, Fall
+from calib.results.outstanding import shown
 from calib.results.solution import Solution
 
 # Where neither is reached a user would decide nothing otherwise: a hundredth of an error is less
@@ -41,6 +42,11 @@ HELD_OUT_BESIDE_SCATTER = 1.4
 # From which it says that something is wrong, though no test does: a choice beyond both of these.
 HELD_OUT_UNSAID = 1.5
 NOTABLE = 1.96  # sigmas: half a 95 % interval
+OF_INSTRUMENTS = {Site.TRACKER, Site.REFERENCE, Site.TARGET, Site.BEAM}
+# Of how far an effect moves the unknowns of one effect, in the sigmas that these had before any
+# data: where it moves all others by less, it is part of that one, as a range offset is of offsets
+# by ring. In the presets' worlds others are moved by less than 1e-5 then, else by more than 0.05.
+PART_OF = 1e-3
 # Share of structure, or held-out error, that names must explain to be the answer: a choice. Of the
 # rms more than half is left by an answer that explains less than that of the squares.
 ABSORBED = 0.7
@@ -133,18 +139,18 @@ def _calibration(look: Look) -> list[str]:
 
 
 def unchecked(look: Look, solution: Solution) -> Iterator[str]:
-    """Of errors of an instrument by one number, a scale, that the model takes in wholly: what one
-    of usual size would change unseen; a sentence each, of those that would change a value by more
-    than its interval.
+    """Of errors of an instrument that the model takes in wholly: what those of usual size would
+    change unseen; a sentence each, of those that would change a value by more than its interval.
+    How an arm is divided into its joints, no data tell, and no pose depends on.
 
     Args:
         look: at the fit as it was.
         solution: of its run.
     """
-    of_instruments, at = {Site.TRACKER, Site.REFERENCE}, look.named.at
-    scales = [e for e in look.named.gauges if e.site in of_instruments and e.name in at]
-    scales = [e for e in scales if len(at[e.name]) == 1]
-    if not scales:
+    at = look.named.at
+    gauges = [e for e in look.named.gauges if e.site in OF_INSTRUMENTS and e.name in at]
+    gauges = [e for e in _by_family(gauges, look) if not _part_of_one(e, look)]
+    if not gauges:
         return
     linear, names = look.linear, _calibration(look)
     _, model, taken = projection(linear, linear.candidates)
@@ -153,18 +159,56 @@ def unchecked(look: Look, solution: Solution) -> Iterator[str]:
     here = [i for i, key in enumerate(keys) if reported.get(key, 0.0) > 0.0]
     keys, taken = [keys[i] for i in here], taken[np.searchsorted(model, linear.among(names))][here]
     sigma = np.array([reported[key] for key in keys])
-    for effect in scales if keys else ():
-        every = (source.rig for source in look.stand.sources)
-        param = next(param for rig in every for param in effect.params(rig))
-        moved = np.abs(taken[:, at[effect.name][0]]) * param.sigma / sigma
+    for effect in gauges if keys else ():
+        usual = np.concatenate([linear.whole.layout.unknowns[n].sigma for n in _its(effect, look)])
+        moved = np.linalg.norm(taken[:, at[effect.name]] * usual, axis=1) / sigma
         most = int(np.argmax(moved))
         if moved[most] > NOTABLE:
             yield (
-                f"Nothing here checks {effect.name}, as other parts of the model take it in: a "
-                f"scale error of {param.sigma:g} would change {keys[most].name} by "
-                f"{moved[most]:.0f} of its sigmas. A length that another instrument measured would "
-                "tell."
+                f"Nothing here checks {effect.name}, as other parts of the model take it in: one "
+                f"of its usual size{_size(effect, look)} would change {keys[most].name} by "
+                f"{moved[most]:.0f} of its sigmas.{_would_tell(effect, look)}"
             )
+
+
+def _by_family(gauges: Sequence[Effect], look: Look) -> list[Effect]:
+    """The first shape of each effect of which no shape can be tested."""
+    tested = {candidate.effect.family for candidate in look.named.candidates}
+    first = {effect.family: effect for effect in reversed(gauges)}
+    return [first[family] for family in first if family not in tested][::-1]
+
+
+def _part_of_one(gauge: Effect, look: Look) -> bool:
+    """Whether an effect of the model has another as a part of it, so that it moves nothing else."""
+    names, layout = _its(gauge, look), look.linear.whole.layout
+    away = np.abs(away_from_model(look.linear, names)) / layout.sigma[:, None]
+    moved = {n: away[at].max() for n, at in layout.at.items() if n not in names and away[at].size}
+    first, *others = sorted(moved, key=lambda name: -moved[name])
+    rest = max((moved[name] for name in others), default=0.0)
+    return bool(layout.unknowns[first].owner.effect) and rest < PART_OF * moved[first]
+
+
+def _its(candidate: Effect, look: Look) -> list[str]:
+    """The unknowns of a candidate, of every rig that has it."""
+    linear = look.linear
+    return [name for name in linear.candidates if linear.owner[name].effect == candidate.name]
+
+
+def _size(effect: Effect, look: Look) -> str:
+    """The usual size of an effect of one number, after a comma; else nothing."""
+    params = next(p for s in look.stand.sources if (p := effect.params(s.rig)))
+    if len(params) > 1:
+        return ""
+    scale, unit = shown(params[0].unit)
+    return f", {scale * params[0].sigma:g}{'' if params[0].unit == '1' else f' {unit}'},"
+
+
+def _would_tell(effect: Effect, look: Look) -> str:
+    """A sentence with what would check an effect, after a blank, where that is known."""
+    if effect.site is Site.BEAM and not all(source.reference for source in look.stand.sources):
+        return " A mesh of the room, which another instrument measured, would tell."
+    scale = effect.site in (Site.TRACKER, Site.REFERENCE)
+    return " A length that another instrument measured would tell." if scale else ""
 
 
 @dataclass(frozen=True)
