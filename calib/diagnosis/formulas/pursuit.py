@@ -169,7 +169,18 @@ def _step(
     over = {f: s for s in sets for f in forms(fitted, bases, s.covariates)}
     if not over:
         return None
-    chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), len(bases.names()))
+    count = len(bases.names())
+
+    def lacks(simpler: Form, best: Form) -> bool:
+        """Whether a covariate of the best form stands out beside a simpler one."""
+        further = _further(simpler, best)
+        if not further:
+            return False
+        mine, more = (f.term.columns(fitted.table.covariates) for f in (simpler, best))
+        beside = fitted.table.beside(mine).projection(more).judged(more)
+        return beside.p_value() < _tail_apart(count, further)
+
+    chosen, alike = simplest(sorted(over, key=lambda f: -f.evidence), count, lacks)
     p = _by_chance(fitted, chosen, over[chosen], judged)
     return ConfirmedTerm(
         form=chosen,
@@ -252,29 +263,47 @@ def _left(projection: Projection, columns: np.ndarray) -> np.ndarray:
     return np.bincount(projection.table.stop, left)
 
 
-def simplest(found: Sequence[Form], covariates: int) -> tuple[Form, list[Form]]:
+def simplest(
+    found: Sequence[Form],
+    covariates: int,
+    lacks: Callable[[Form, Form], bool] = lambda simpler, best: False,
+) -> tuple[Form, list[Form]]:
     """The simplest of the forms that stops cannot tell from the best, nor from the best of the same
     covariates, and the others of these.
 
     Args:
         found: best first.
         covariates: how many there are.
+        lacks: whether the best form, the second, says more than a simpler one by a test of its own:
+            few stops differ so much in what a gross structure does to each that the first test can
+            tell nothing apart, as its ratio is never more than the root of their number.
     """
     best = {frozenset(f.term.covariates): f for f in reversed(found)}
     both = [(f, {found[0], best[frozenset(f.term.covariates)]}) for f in found]
     near = [f for f, than in both if not any(_told_apart(f, b, covariates) for b in than)]
-    chosen = min(near, key=lambda f: (f.term.cost, f.dof, -f.statistic))
-    return chosen, [f for f in near if f is not chosen]
+    order = sorted(near, key=lambda f: (f.term.cost, f.dof, -f.statistic))
+    chosen = next(f for f in order if f is found[0] or not lacks(f, found[0]))
+    passed = order[: order.index(chosen)]
+    return chosen, [f for f in near if f is not chosen and f not in passed]
 
 
 def _told_apart(form: Form, best: Form, covariates: int) -> bool:
     worse = (form.left - best.left)[best.left > 0.0]
-    further = len(set(best.term.covariates) - set(form.term.covariates))
-    limit = -float(special.ndtri(special.ndtr(-SIGMAS_APART) / max(covariates, 1) ** further))
+    limit = -float(special.ndtri(_tail_apart(covariates, _further(form, best))))
     if form is best or worse.sum() <= limit**2:
         return False
     scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
     return bool(worse.sum() > limit * scatter)
+
+
+def _further(form: Form, best: Form) -> int:
+    """How many covariates the best form has that another has not."""
+    return len(set(best.term.covariates) - set(form.term.covariates))
+
+
+def _tail_apart(covariates: int, further: int) -> float:
+    """How often chance alone may tell a form from one of so many covariates less."""
+    return float(special.ndtr(-SIGMAS_APART) / max(covariates, 1) ** further)
 
 
 def _best_factors(
