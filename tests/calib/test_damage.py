@@ -32,8 +32,8 @@ TIMES = 10  # the detectable size
 UNCHANGED = 1.0  # sigma of the good recording's fit
 # Times as many passes as the good recording's fit, which takes 9: of what is given up (markers
 # exchanged: 21 passes), and of what comes to an optimum with something wrong beside it (a mesh of
-# wrong scale: 55, of which the last 28 lower the cost by 2 %, as regions that shift and tilt take in
-# more of the mesh, and beams one by one; with robust scales that are kept it is 54).
+# wrong scale: 55, of which the last 28 lower the cost by 2 %, as regions that shift and tilt take
+# in more of the mesh, and beams one by one; with robust scales that are kept it is 54).
 GIVEN_UP, ARRIVED = 2.4, 6.5
 LONGEST_S = 60
 ENOUGH = 30  # cases that were run, for their passes to be looked at
