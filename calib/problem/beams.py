@@ -25,6 +25,8 @@ OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
 # 18202 (table 3, row 7) allows a good wall. A fit starts from it and estimates it, but for what is
 # always there: a coat of paint, 0.05 mm thick or more, assumed to be no more even than that.
 UNEVEN_M, FLATTEST_M = 1e-3, 5e-5
+# Widths of the cells that planes are looked for in. A choice: walls are wider than the last.
+CELLS_M = (0.3, 0.6, 1.2)
 
 
 def add_beams(problem: Problem, part: SourceStops, places: Places, progress: Progress) -> None:
@@ -103,8 +105,10 @@ def _planes_unknown(found: PlaneSurface, owner: Owner) -> Unknown:
 
 
 def _find_planes(problem: Problem, part: SourceStops, places: Places, progress: Progress) -> Planes:
+    """Planes in cells as wide as most points are then in planes: where scans are sparse, there are
+    too few of them in a narrow cell to see that it is flat, and a wide one has edges in it."""
     recording, rig = part.source.recording, part.source.rig
-    finder = PlaneFinder(noise_m=rig.lidar.sigma_range_m)
+    finders = [PlaneFinder(cell_m=width, noise_m=rig.lidar.sigma_range_m) for width in CELLS_M]
     store = part.source.of_beams(None).store  # the same planes, however many beams are used
     scanned = list(places.scanned())
     for i, (k, stops) in enumerate(scanned):
@@ -112,8 +116,10 @@ def _find_planes(problem: Problem, part: SourceStops, places: Places, progress: 
         _, ray = store.read(k)
         T = stops.in_reference(rig.lidar_frame, problem.initial, False).T[0]
         points_m = ray.origin_m + ray.range_m[:, None] * ray.direction
-        finder.add(k, se3.apply(T, points_m), T[:3, 3])
-    planes = finder.planes(min_points=LEAST_BEAMS)
+        for finder in finders:
+            finder.add(k, se3.apply(T, points_m), T[:3, 3])
+    found = [finder.planes(min_points=LEAST_BEAMS) for finder in finders]
+    planes = max(found, key=lambda planes: planes.count.sum())
     if not len(planes.normal):
         raise InputError(
             f"{recording.folder}: there is no mesh, and no flat patch in the scans to fit to; "

@@ -4,8 +4,8 @@ Mesh error is smooth over whole surfaces, so a fit carries one displacement alon
 surface, per region and per patch: without them neighbouring points would count as independent
 facts. Regions are tilted, too: an error that is smooth has slopes, and without tilts of regions the
 slope of a floor, which many beams show, would count as a tilt of the whole room. Walls are no
-flatter: planes found in the scans have regions and patches as well. These have no tilts: with them
-a fit to one still hold of an XT32 went astray. Where a plane is as a whole is itself estimated.
+flatter: planes found in the scans have regions and patches as well. Where a plane is as a whole is
+itself estimated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calib.problem.unknowns import Owner, Role, Unknown, vector_unknown
 from calib.residuals.beams import Association
 from calib.residuals.groups import REGION_PART
 from calib.residuals.scan import ScanStop
-from calib.residuals.surfaces import PLANE_PATCHES_M, MeshSurface, PlaneSurface
+from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, PlaneSurface
 
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its beams
@@ -63,7 +63,7 @@ def with_surfaces(problem: Problem, associations: Sequence[Association]) -> Prob
                 room=room,
             )
             some = {name: whole}
-            if column == REGION_PART and isinstance(first.meeting, MeshSurface):
+            if column == REGION_PART:
                 some |= _tilts(name, whole, first.meeting)
             sigma_m = cell_sigma_m(first, column)
             unknowns += [_unknown(n, each, scatter(each, sigma_m)) for n, each in some.items()]
@@ -80,8 +80,14 @@ def kinds_of(scan: ScanStop) -> dict[str, str]:
 
 
 def parts_of(planes: PlaneSurface) -> list[str]:
-    """The unknowns of the parts of planes, one for each kind."""
+    """The unknowns of how far the parts of planes stand off, one for each kind."""
     return [f"{planes.variable}/{column}" for column in PLANE_PATCHES_M]
+
+
+def cells_of(planes: PlaneSurface) -> list[str]:
+    """All unknowns of the parts of planes, tilts included."""
+    names = dict(zip(PLANE_PATCHES_M, parts_of(planes), strict=True))
+    return [*names.values(), *(_tilt(names[REGION_PART], axis) for axis in (0, 1))]
 
 
 def cell_sigma_m(scan: ScanStop, column: str) -> float:
@@ -117,15 +123,20 @@ def well_seen(problem: Problem, associations: Sequence[Association]) -> list[Ass
     return found
 
 
-def _tilts(name: str, regions: SurfaceCells, mesh: MeshSurface) -> dict[str, SurfaceCells]:
+def _tilts(name: str, regions: SurfaceCells, met: Meeting) -> dict[str, SurfaceCells]:
     """Tilts of the regions that are wide enough for one, by unknown."""
     found = {}
-    for axis, wide in enumerate(mesh.tilting(regions.parts).T):
+    for axis, wide in enumerate(met.tilting(regions.parts).T):
         if wide.any():
             parts, surface = regions.parts[wide], regions.surface[wide]
             tilts = replace(regions, parts=parts, surface=surface, axis=axis)
-            found[f"{name}.tilt_{axis}"] = tilts
+            found[_tilt(name, axis)] = tilts
     return found
+
+
+def _tilt(regions: str, axis: int) -> str:
+    """The unknown of the tilts of some regions along an axis of their surfaces."""
+    return f"{regions}.tilt_{axis}"
 
 
 def _unknown(name: str, cells: SurfaceCells, sigma: float) -> Unknown:

@@ -45,6 +45,8 @@ class Meeting(Protocol):
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
+    def tilting(self, regions: np.ndarray) -> np.ndarray: ...
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
 
     def associate(
@@ -95,8 +97,7 @@ class MeshSurface:
 
     def tilting(self, regions: np.ndarray) -> np.ndarray:
         """Which regions (R, 2) are wider than a patch, along each axis of their surface."""
-        widths_m = self.reference.widths_m(self.patches_m[REGION_PART])
-        return widths_m[self.surface_of(REGION_PART, regions)] > self.patches_m[PATCH]
+        return _wide(self, self.reference, regions)
 
     def surfaces(self, association: Association) -> np.ndarray:
         """The surface (N,) that each beam meets, -1 for none."""
@@ -210,6 +211,13 @@ class PlaneSurface:
         """The plane that each of those parts is of."""
         return self._grid.patch_surface(self.patches_m[kind])[parts]
 
+    def tilting(self, regions: np.ndarray) -> np.ndarray:
+        """Which regions (R, 2) are wider than a patch, along each axis of their plane. One that is
+        all of its plane tilts with it."""
+        several = self._grid.patches(self.patches_m[REGION_PART]) > 1
+        parts = several[self.surface_of(REGION_PART, regions)]
+        return _wide(self, self._grid, regions) & parts[:, None]
+
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
         """The planes (N,) that beams meet from there, and the patches of them."""
         met = _Met(T, beams, _and_none(self.planes.normal, self.planes.distance_m), part)
@@ -217,7 +225,11 @@ class PlaneSurface:
             kind: self._patch(met, size_m).astype(np.int32)
             for kind, size_m in self.patches_m.items()
         }
-        return Association(part, patches)
+        hit = np.flatnonzero(met.part >= 0)
+        where = met.part[hit], met.point_m[hit], self.patches_m[REGION_PART]
+        away_m = np.zeros((len(part), 2), np.float32)
+        away_m[hit] = self._grid.from_middle_m(*where)
+        return Association(part, patches, away_m)
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
@@ -350,6 +362,14 @@ def part_counts(reference: Reference) -> dict[str, int]:
     return surfaces | {
         kind: len(reference.patch_surface(size_m, kind == PATCH)) for kind, size_m in widths_m
     }
+
+
+def _wide(
+    met: MeshSurface | PlaneSurface, grid: Reference | SurfaceGrid, regions: np.ndarray
+) -> np.ndarray:
+    """Which regions (R, 2) of a grid are wider than a patch, along each axis of their surface."""
+    widths_m = grid.widths_m(met.patches_m[REGION_PART])
+    return widths_m[met.surface_of(REGION_PART, regions)] > met.patches_m[PATCH]
 
 
 def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str, float]:

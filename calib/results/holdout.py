@@ -17,7 +17,7 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.spread import spread_of, with_spread
-from calib.problem.surfaces import parts_of
+from calib.problem.surfaces import cells_of
 from calib.problem.unknowns import Role
 from calib.residuals.beams import Rows
 from calib.residuals.scan import ScanStop
@@ -285,7 +285,7 @@ def _without_planes(trained: Problem, start: Start | None) -> Start | None:
     found = [m for m in trained.meetings.values() if isinstance(m, PlaneSurface)]
     if start is None or not found:
         return start
-    return start.without([name for each in found for name in (each.variable, *parts_of(each))])
+    return start.without([name for each in found for name in (each.variable, *cells_of(each))])
 
 
 def predict(

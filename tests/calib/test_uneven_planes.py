@@ -16,6 +16,7 @@ from tests.mishaps import Scene
 
 BEAMS = 4000  # of a stop: enough neighbours for a flat patch to be seen
 UNEVEN_M = 0.001
+REGION_M = 1.2
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +63,20 @@ def ring_errors(truth, estimate):
 def test_cells_are_a_partition_of_the_beams_of_each_plane(fitted):
     _, estimate = fitted(UNEVEN_M)
     names = list(estimate.problem.cells)
-    assert len(names) == 2
+    assert len(names) == 4  # of regions and of patches, and regions tilt about two axes
     seen = {name: [] for name in names}
     for scan, met in zip(estimate.scans, estimate.associations, strict=True):
         assert isinstance(scan.meeting, PlaneSurface)
         for name, cells in scan.cells.items():
             cell = cells.of_beams(scan.parts(met, cells.column))
-            np.testing.assert_array_equal(cell >= 0, met.part >= 0)
             mine = met.part >= 0
+            if cells.axis is None:
+                np.testing.assert_array_equal(cell >= 0, mine)
+            else:  # a narrow region does not tilt, nor one that is all of its plane
+                several = scan.meeting.planes.grid(scan.meeting.axes).patches(REGION_M) > 1
+                assert not (cell >= 0)[~(mine & several[met.part])].any()
+                assert np.mean(cell[mine] >= 0) > 0.7
+                mine = cell >= 0
             of = estimate.problem.cells[name].surface[cell[mine]]
             np.testing.assert_array_equal(of, met.part[mine])
             seen[name].append(np.unique(cell[mine]))

@@ -81,8 +81,10 @@ def rejects(stand: Stand, progress: Progress = lambda what, done, total: None) -
     beyond = len(others) / total - hit > CLUTTER
     hit_at = crowded.any(axis=1)
     share = len(counts.rejected) / total
-    # Of scans with few beams there may be too few on each surface to say so of it.
-    if beyond and less.in_the_way(share):
+    # Of scans with few beams there may be too few on each surface to say so of it. Near planes
+    # found in the scans other surfaces may be, before them and behind.
+    other = less.in_the_way if counts.place_names else less.beside_each_other
+    if beyond and other(share):
         hit, beyond = hit + len(less) / total, False
         hit_at[less.stop] = True
     return Rejects(

@@ -84,16 +84,20 @@ class Rejected:
         """Which share of them ends before the mesh; 0 of none."""
         return float(np.mean(self.residual_m < 0)) if len(self) else 0.0
 
-    def in_the_way(self, share: float) -> bool:
-        """Whether they hit things nearer than the mesh, at all distances: things are wider than a
-        beam, and errors of single beams are not.
+    def beside_each_other(self, share: float) -> bool:
+        """Whether what most of them hit is wider than a beam, which errors of single beams are not.
 
         Args:
             share: of all beams that are rejected.
         """
         chance = 1.0 - (1.0 - share) ** 2  # that one beside is rejected too, before it or after
-        wide = len(self) > 0 and self.beside.mean() - chance > MOSTLY_BESIDE * (1.0 - chance)
-        return bool(wide) and self.short > MOSTLY_SHORT and not self.coherent
+        wide = self.beside.mean() - chance if len(self) else 0.0
+        return bool(wide > MOSTLY_BESIDE * (1.0 - chance))
+
+    def in_the_way(self, share: float) -> bool:
+        """Whether they hit things nearer than the mesh, at all distances; argument as of
+        `beside_each_other`."""
+        return self.beside_each_other(share) and self.short > MOSTLY_SHORT and not self.coherent
 
     @property
     def agreeing(self) -> Rejected:
