@@ -42,6 +42,7 @@ def adapted(
     Where `trial` is False they are left out at once: what stood out was tried and not confirmed.
     """
     on_trial: tuple[Look, int] | None = None  # where to go back to, and how many were left out
+    first, known = look, len(left)
     for _ in range(ADAPTED if look.stand.estimate.converged else MENDED):
         estimate = look.stand.estimate
         stray = list(stray_scans(estimate.problem, estimate.values, look.checked))
@@ -64,6 +65,35 @@ def adapted(
     if on_trial:
         look, count = on_trial
         del left[count:]
+    return _blamed_on_others(first, look, left, known, progress)
+
+
+def _blamed_on_others(
+    first: Look, last: Look, left: list[LeftOut], known: int, progress: Progress
+) -> Look:
+    """The last look without the parts of the mesh that were left out since the first one, where
+    they stand out no more once all else is left out: what a scan says of them moves and tilts them,
+    and then they seem worse than the scan.
+
+    Args:
+        first: where nothing but those `known` was left out.
+        last: where all of them are.
+        left: what was left out, from which the parts are taken.
+        known: how many of these the first look was without.
+        progress: as of `adapted`.
+    """
+    of_mesh = [each for each in left[known:] if each.blunder.group.where == MESH]
+    others = [each for each in left[known:] if each.blunder.group.where != MESH]
+    if not of_mesh or not others:
+        return last
+    stand = tried(first.stand.without, [each.blunder.group for each in others], progress)
+    if stand is None or not stand.estimate.converged:
+        return last
+    look = stand.look(progress)
+    loud = {blunder.group for blunder in look.blunders if blunder.found}
+    if any(each.blunder.group in loud for each in of_mesh):
+        return last
+    left[known:] = others
     return look
 
 
