@@ -76,7 +76,7 @@ class Groups:
                     self.scale[rows] = 1 / np.sqrt(unknown.weight)
                 self.parts[group] = Part(rows[k], np.eye(len(k)), np.diag(sigma))
         for name, cells in self.problem.cells.items():
-            if cells.axis is not None:
+            if cells.of_mesh and cells.axis is not None:
                 self._tilted(self._rows(f"prior:{name}"), name, cells)
         for i, scan in enumerate(self.problem.scans):
             recording = scan.recording.folder.name if self.several else ""
