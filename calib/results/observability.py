@@ -49,6 +49,19 @@ def odd(estimate: Estimate) -> list[str]:
     return [*numbers, *([shown_by_no_other(alone)] if alone else []), *rooms]
 
 
+def not_heard(not_estimated: Sequence[Mapping[str, str]]) -> list[str]:
+    """Parameters of beams that were rejected, so that nobody knows them; a sentence, or none."""
+    names = [each["name"] for each in not_estimated if each["why"] == REJECTED_BEAMS]
+    if not names:
+        return []
+    several = len(names) > 1
+    return [
+        f"Half or more of the beams of {listed(names)} were rejected, so "
+        f"{'they are' if several else 'it is'} as known before the fit, and no better: what do "
+        "these beams see?"
+    ]
+
+
 def seen_alone(estimate: Estimate) -> list[Group]:
     """Scans that see planes of their own, where planes are what was found in the scans: such a scan
     tells nothing, and one that belongs to another stop is such a scan."""

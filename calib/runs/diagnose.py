@@ -35,7 +35,7 @@ from calib.recalibration.between import moved_between
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
-from calib.results.observability import seen_alone, shown_by_no_other
+from calib.results.observability import not_heard, seen_alone, shown_by_no_other
 from calib.results.outstanding import moves
 from calib.results.rings import detectable, harmful, odd_rings
 from calib.results.sigmas import TOLERATED
@@ -128,6 +128,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
             *result.sentences,
             *(told.uneven(last.blunders) if run.converged else ()),
             *unchecked(found.looks[0], run.solution),
+            *not_heard(run.solution.not_estimated),
             *hardly_checked(unseen),
             *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),

@@ -8,6 +8,8 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.results.intervals import intervals
+from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.simulation import Spec
 from calib.solve.fit import solve
 from sensors.documents import Marks
@@ -102,6 +104,14 @@ def test_a_ring_that_meets_clutter_is_not_known_by_the_beams_that_agree_by_chanc
     assert np.abs(offset[12] - true[12]) > 4e-3  # it is off, by more than others' sigmas
     assert sigma[12] > 0.03
     assert np.median(sigma) < 1.5e-3
+
+
+def test_a_diagnosis_says_which_ring_nobody_knows(tmp_path):
+    source, _ = made(tmp_path / "rec", SMALL)
+    source = with_ring_off(source, 12, clutter(5))
+    run = calibrate(source.recording.folder, tmp_path / "run", hold_out="none")
+    said = [s for s in diagnose(run).sentences if "what do these beams see" in s]
+    assert len(said) == 1 and "ring_range_offset.ring_012 were rejected, so it is" in said[0]
 
 
 def test_what_an_earlier_run_knew_of_a_ring_that_meets_clutter_stays(tmp_path):
