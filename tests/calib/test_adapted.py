@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from calib.diagnosis.search import mishaps
+from calib.residuals.groups import MESH
 
 
 class ScriptedLook:
@@ -44,7 +45,8 @@ def left_out(monkeypatch):
     return run
 
 
-ONE = [SimpleNamespace(group=SimpleNamespace(kind="surface", token="mesh:surface_4"), evidence=9.0)]
+PART = SimpleNamespace(kind="surface", where=MESH, token="mesh:surface_4")
+ONE = [SimpleNamespace(group=PART, evidence=9.0)]
 QUIET = ([], False, True)
 
 
@@ -78,3 +80,25 @@ def test_a_fit_without_optimum_is_mended_in_two_rounds_or_not_at_all(left_out, m
     assert left_out(*looks) == 5
     monkeypatch.setattr(ScriptedLook, "converged", False)
     assert left_out(*looks) == mishaps.MENDED == 2
+
+
+@pytest.mark.parametrize("innocent", [True, False])
+def test_parts_of_the_mesh_that_a_scan_made_stand_out_are_kept(innocent):
+    """Where the part stands out no more once the scan is left out, it is none of those left out."""
+    scan = SimpleNamespace(kind="scan", where="L00P01", token="L00P01:scan")
+    before, part, wrong = (
+        SimpleNamespace(blunder=SimpleNamespace(group=g, found=True)) for g in (PART, PART, scan)
+    )
+    after = SimpleNamespace(blunders=[] if innocent else [part.blunder])
+
+    def without(groups, progress):
+        assert groups == [scan]
+        stand = SimpleNamespace(estimate=SimpleNamespace(converged=True))
+        stand.look = lambda progress: after
+        return stand
+
+    first = SimpleNamespace(stand=SimpleNamespace(without=without))
+    left, last = [before, part, wrong], object()
+    found = mishaps._blamed_on_others(first, last, left, 1, lambda what, done, total: None)
+    assert found is (after if innocent else last)
+    assert left == ([before, wrong] if innocent else [before, part, wrong])
