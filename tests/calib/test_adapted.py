@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from calib.diagnosis.search import mishaps
-from calib.residuals.groups import MESH
+from calib.residuals.groups import MESH, SCAN, Group
 
 
 class ScriptedLook:
@@ -45,7 +45,7 @@ def left_out(monkeypatch):
     return run
 
 
-PART = SimpleNamespace(kind="surface", where=MESH, token="mesh:surface_4")
+PART = Group("surface", MESH, "surface_4")
 ONE = [SimpleNamespace(group=PART, evidence=9.0)]
 QUIET = ([], False, True)
 
@@ -85,7 +85,7 @@ def test_a_fit_without_optimum_is_mended_in_two_rounds_or_not_at_all(left_out, m
 @pytest.mark.parametrize("innocent", [True, False])
 def test_parts_of_the_mesh_that_a_scan_made_stand_out_are_kept(innocent):
     """Where the part stands out no more once the scan is left out, it is none of those left out."""
-    scan = SimpleNamespace(kind="scan", where="L00P01", token="L00P01:scan")
+    scan = Group("scan", "L00P01", SCAN)
     before, part, wrong = (
         SimpleNamespace(blunder=SimpleNamespace(group=g, found=True)) for g in (PART, PART, scan)
     )
