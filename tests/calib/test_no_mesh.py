@@ -42,6 +42,9 @@ def test_most_beams_of_a_plane_are_no_board_before_it(stretched, share, structur
     (place,) = (p for p in found.rejected.places if p.beside_a_plane)
     assert replace(place, share=share).structured == structured
     assert replace(place, meshed=True).structured
+    curtain = replace(place, share=share, coherent=False, short=0.5)
+    assert not curtain.structured and curtain.no_plane == structured
+    assert replace(curtain, meshed=True).structured == structured
 
 
 def test_what_planes_take_in_wholly_is_said_with_what_it_does(stretched):

@@ -95,16 +95,26 @@ class Place:
         return not self.coherent and self.short > MOSTLY_SHORT
 
     @property
+    def of_a_plane(self) -> bool:
+        """Whether it is the beams near a plane found in the scans."""
+        return self.covariate == SURFACE and not self.meshed
+
+    @property
     def beside_a_plane(self) -> bool:
-        """Whether it is the lesser part of the beams near a plane found in the scans, and all of
-        them end as far from it: on a board before a wall, as nothing says that there is none."""
-        plane = self.covariate == SURFACE and not self.meshed
-        return plane and self.coherent and self.share <= STRUCTURED_SHARE
+        """Whether it is the lesser part of the beams near a plane, and all of them end as far from
+        it: on a board before a wall, as nothing says that there is none."""
+        return self.of_a_plane and self.coherent and self.share <= STRUCTURED_SHARE
+
+    @property
+    def no_plane(self) -> bool:
+        """Whether it is most of the beams near a plane, and they end anywhere: a curtain, that wide
+        cells take for flat."""
+        return self.of_a_plane and not self.coherent and self.share > STRUCTURED_SHARE
 
     @property
     def harmless(self) -> bool:
         """Whether things explain it that nothing says are not there."""
-        return self.in_the_way or self.beside_a_plane
+        return self.in_the_way or self.beside_a_plane or self.no_plane
 
     @property
     def where(self) -> str:
@@ -125,6 +135,8 @@ class Place:
         if self.beside_a_plane:
             side = "before" if self.residual_m < 0 else "behind"
             return f"they end on another surface, {self.size} mm {side} that plane"
+        if self.no_plane:
+            return "what was taken for a plane is none"
         if self.coherent and self.along == ALONG_NORMAL:
             return f"they end {self.size} mm {'before' if self.residual_m < 0 else 'behind'} it"
         if self.coherent:
