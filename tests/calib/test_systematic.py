@@ -9,28 +9,30 @@ from calib import add, diagnose, fit
 
 from ..worlds import World, write
 
-SEAM_M = 0.008
+TAKEN_IN = "regions of the mesh that tilt take in so much of it that it has no name (p = 0.8)"
 
 
 @pytest.mark.long
-def test_half_of_a_mesh_that_is_8_mm_off_is_a_seam_and_no_scatter_of_the_targets(tmp_path):
+@pytest.mark.parametrize(
+    "seam_m", [pytest.param(0.006, marks=pytest.mark.xfail(reason=TAKEN_IN)), 0.008]
+)
+def test_half_of_a_mesh_that_is_off_is_a_seam_and_no_scatter_of_the_targets(tmp_path, seam_m):
     """Mesh and spheres contradict each other systematically; wider sigmas for both would leave the
-    room nowhere. Of 6 mm, regions of the mesh that tilt take in more of a seam than is left to tell
-    it by here (p = 0.8), and what is found has no name."""
+    room nowhere."""
     write(World(seed=11), tmp_path / "rec")
-    seam_m = with_half_raised(tmp_path / "rec/reference/mesh.ply", SEAM_M)
+    at_m = with_half_raised(tmp_path / "rec/reference/mesh.ply", seam_m)
     run = fit(tmp_path / "rec", tmp_path / "run", hold_out="none")
     found = diagnose(run)
     (name,) = found.worth_adding
     family, _, shape = name.partition("@")
     assert (found.verdict, family) == ("missing_effect", "mesh_seam_x")
-    assert abs(float(shape) - seam_m) < 0.1
+    assert abs(float(shape) - at_m) < 0.1
     assert found.scatter == []
     with_it = add(run, [name], tmp_path / "with")
     assert diagnose(with_it).verdict == "adequate"
     shift_m = with_it.solution.part(None).effects[name].estimate[2]
     # Triangles of 0.2 m lie across the seam and slope; they pull towards a smaller step.
-    assert -SEAM_M < shift_m < -SEAM_M / 2
+    assert -seam_m < shift_m < -seam_m / 2
 
 
 def with_half_raised(path, by_m):

@@ -174,9 +174,11 @@ def _step(
     def lacks(simpler: Form, best: Form) -> bool:
         """Whether a covariate of the best form stands out beside a simpler one, where stops confirm
         a smooth function of its covariates: a form may live on few beams."""
-        further, smooth = _further(simpler, best), over[best]
+        if not (further := _further(simpler, best)):
+            return False
+        smooth = over[best]
         known = judged(smooth.covariates, smooth.plain).p_value()
-        if not further or after_looks(known, smooth.looks) >= alpha:
+        if after_looks(known, smooth.looks) >= alpha:
             return False
         mine, more = (f.term.columns(fitted.table.covariates) for f in (simpler, best))
         beside = fitted.table.beside(mine).projection(more).judged(more)
