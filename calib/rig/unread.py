@@ -32,7 +32,7 @@ def with_unread(rig: Rig, recording: RecordedStops) -> RecordedStops:
     missing = np.isnan(recording.joints)
     if not missing.any():
         return recording
-    lower, upper = _limits(rig)
+    lower, upper = joint_limits(rig)
     q = np.where(missing, (lower + upper) / 2.0, recording.joints)
     lacking = {n for n, gone in zip(rig.joint_names, missing.T, strict=True) if gone.any()}
     seen = {b: _Body(b, p) for b, p in recording.bodies.items() if np.isfinite(p[:, :3]).any()}
@@ -59,12 +59,31 @@ def _standing(rig: Rig, recording: RecordedStops) -> Array:
     return np.array(labels[rig.moves])
 
 
-def _limits(rig: Rig) -> tuple[Array, Array]:
-    """(J,) of all joints; a whole turn, or a metre either way, where the URDF has none."""
+def joint_limits(rig: Rig) -> tuple[Array, Array]:
+    """Lower and upper (J,) of all joints; a whole turn, or a metre either way, where the URDF has
+    none."""
     far = np.array([np.pi if j.kind == "revolute" else 1.0 for j in rig.joints])
     said = np.array([[j.lower, j.upper] for j in rig.joints]).T
     lower, upper = np.where(np.isfinite(said), said, [-far, far])
     return lower, upper
+
+
+def values_between(rig: Rig, q: Array, missing: Array) -> Array:
+    """Joints (N, K, J) with what is `missing` of some (K, J) on a grid over the limits, a whole
+    turn at most; those given first."""
+    lower, upper = joint_limits(rig)
+    turns = np.array([j.kind == "revolute" for j in rig.joints])
+    middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
+    half = np.where(turns, np.minimum(half, np.pi), half)
+    lacking = np.flatnonzero(missing.any(axis=0))
+    each = max(2, min(MOST_OF_ONE, round(STARTS ** (1.0 / len(lacking)))))
+    grid = np.stack(np.meshgrid(*[np.arange(each)] * len(lacking)), axis=-1)
+    share = 2.0 * (grid.reshape(-1, len(lacking)) + 0.5) / each - 1.0
+    share = share[:: -(-len(share) // STARTS)]
+    tried = np.repeat(q[None], 1 + len(share), axis=0)
+    value = middle[lacking] + share[:, None] * half[lacking]
+    tried[1:, :, lacking] = np.where(missing[:, lacking], value, tried[1:, :, lacking])
+    return tried
 
 
 @dataclass(frozen=True)
@@ -147,20 +166,8 @@ class _Some:
         return min(found, key=lambda each: each[0])[1]
 
     def _tried(self) -> Array:
-        """(N, K, J) values on a grid over the limits, a whole turn at most, those given first."""
-        lower, upper = _limits(self.rig)
-        turns = np.array([j.kind == "revolute" for j in self.rig.joints])
-        middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
-        half = np.where(turns, np.minimum(half, np.pi), half)
-        lacking = np.flatnonzero(self.missing.any(axis=0))
-        each = max(2, min(MOST_OF_ONE, round(STARTS ** (1.0 / len(lacking)))))
-        grid = np.stack(np.meshgrid(*[np.arange(each)] * len(lacking)), axis=-1)
-        share = 2.0 * (grid.reshape(-1, len(lacking)) + 0.5) / each - 1.0
-        share = share[:: -(-len(share) // STARTS)]
-        tried = np.repeat(self.q[None], 1 + len(share), axis=0)
-        value = middle[lacking] + share[:, None] * half[lacking]
-        tried[1:, :, lacking] = np.where(self.missing[:, lacking], value, tried[1:, :, lacking])
-        return tried
+        """(N, K, J) values of what is missing, see `values_between`."""
+        return values_between(self.rig, self.q, self.missing)
 
     def _bases(self, body: _Body) -> Array:
         """T_world_root (n, 4, 4), best first: where a body was seen at one stop, with each of the
@@ -199,7 +206,7 @@ class _Some:
     def _down(self, q: Array, root: Array, moves: bool) -> tuple[Array, Array]:
         """Joints, and the root where it moves, after some steps of Gauss and Newton; within the
         limits where it does not, as these may be all that tells it from the first joint."""
-        lower, upper = (-np.inf, np.inf) if moves else _limits(self.rig)
+        lower, upper = (-np.inf, np.inf) if moves else joint_limits(self.rig)
         for _ in range(STEPS):
             step, of_root = self._step(q, root, moves)
             q = np.where(self.missing, np.clip(q + step, lower, upper), q)
@@ -222,7 +229,7 @@ class _Some:
             b_root += np.matvec(d_root.mT, off).sum(axis=0)
         stiff = STIFF * max(float(np.abs(A).max(initial=0.0)), 1e-12)
         A += np.where(self.missing, stiff, 1.0)[:, None] * np.eye(J)
-        b += stiff * np.where(self.missing, np.mean(_limits(self.rig), axis=0) - q, 0.0)
+        b += stiff * np.where(self.missing, np.mean(joint_limits(self.rig), axis=0) - q, 0.0)
         of_root = np.zeros(6)
         if moves:
             gone = np.linalg.solve(A, by_root)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
 from calib.solve.estimate import Estimate, Start, rest_of, values_of
 from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
 from calib.solve.otherwise.orientations import lidars_turned
+from calib.solve.otherwise.unseen import joints_by_scans
 from calib.solve.reweight import reweighted
 from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
@@ -38,12 +39,12 @@ def solve(
 
     Trackers and targets alone are solved first; where bodies are then far from where the chain puts
     them, also from starts with a joint's zero or a frame turned, and the least cost wins. A LiDAR
-    whose beams end far from the mesh is turned as they fit it best. Then each pass linearises every
-    stop's rows at the present state (robust weights and, until the fit has settled, the surface met
-    included), eliminates what belongs to surfaces and stops, and takes one Gauss-Newton step of the
-    graph of all that is left, as far as it lowers the cost. From an earlier state, what beams meet
-    is known and a few passes are all; where the cost ends above that of the state, the fit has not
-    converged.
+    whose beams end far from the mesh is turned as they fit it best, and joints that nothing else
+    tells are bent so. Then each pass linearises every stop's rows at the present state (robust
+    weights and, until the fit has settled, the surface met included), eliminates what belongs to
+    surfaces and stops, and takes one Gauss-Newton step of the graph of all that is left, as far as
+    it lowers the cost. From an earlier state, what beams meet is known and a few passes are all;
+    where the cost ends above that of the state, the fit has not converged.
 
     A fit whose bodies, beams, or rows of trackers and targets are hopelessly far off is given up.
 
@@ -74,7 +75,7 @@ def solve(
         loop.values |= declared(problem, loop.held)  # nothing was known of these without scans
         if not loop.lost:
             loop.values |= loop.journal.answer(
-                loop.values, lambda: lidars_turned(loop.problem, loop.values)
+                loop.values, lambda: _put_by_scans(loop.problem, loop.values)
             )
             loop.lost = not look_around(loop)
         if spread:
@@ -100,6 +101,12 @@ def _without_scans(loop: Loop, problem: Problem, turns: bool) -> None:
                 loop.solve_without_scans(values)
         loop.reweigh(beams=False)
         loop.lost = loop.bodies_astray()
+
+
+def _put_by_scans(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """LiDARs turned, and joints that nothing else tells bent, as scans fit the mesh."""
+    turned = lidars_turned(problem, values)
+    return turned | joints_by_scans(problem, {**values, **turned})
 
 
 def _arrive(loop: Loop, tolerance: float) -> None:
@@ -197,7 +204,7 @@ def preview(problem: Problem, progress: Progress = lambda what, done, total: Non
     loop.reweigh(beams=False)
     if problem.scans:
         if not loop.bodies_astray():
-            loop.values |= lidars_turned(problem, loop.values)
+            loop.values |= _put_by_scans(problem, loop.values)
         loop.fix_association()
     return loop.estimate()
 

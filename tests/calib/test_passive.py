@@ -180,3 +180,26 @@ def test_no_formula_is_sought_for_a_joint_that_nobody_read(folders, tmp_path):
     assert set(tables) == {f"joint_{i}" for i in (1, 3, 4, 6)}
     sigma = tables["joint_3"].sigma_m
     assert np.sum(sigma > 0.1) == 1 and np.sum(sigma < 0.01) == 39
+
+
+@pytest.mark.parametrize("passive", [("joint_2",), ("joint_1", "joint_3", "joint_5")])
+def test_a_scan_tells_where_joints_were_whose_body_was_not_seen(tmp_path, passive):
+    """The optimum is that of the same recording in which the body was seen at these stops, too."""
+    scanned = {**PRESETS["tiny"].model_dump(), "passive": passive, "occluded_share": 0}
+    simulate(Spec(**scanned), tmp_path / "rec", seed=22)
+    seen = solve(build([Source.open(tmp_path / "rec")], Model()))
+    table = pd.read_csv(tmp_path / "rec/stops.csv")
+    untold = [0, 4, 5, 10]
+    table.loc[untold, [c for c in table if c.startswith("mount_markers.")]] = np.nan
+    table.to_csv(tmp_path / "rec/stops.csv", index=False)
+    source = Source.open(tmp_path / "rec")
+    estimate = solve(build([source], Model()))
+    assert estimate.converged
+    whole = seen.problem.sources[0].recording.joints
+    for k in untold:
+        name, missing = f"joints@{source.recording.stops[k]}", [int(j[-1]) - 1 for j in passive]
+        was = (whole[k] + seen.values[name])[missing]
+        off = (source.recording.joints[k] + estimate.values[name])[missing] - was
+        sigma = np.sqrt(np.diag(estimate.covariance_of([name])))[missing]
+        assert np.abs(off).max() < 4 * sigma.max() < 0.02
+    assert np.abs(source.recording.joints - whole)[untold].max() > 20 * OFF_RAD
