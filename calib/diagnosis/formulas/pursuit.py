@@ -30,6 +30,10 @@ REFINED = 5  # products whose constants are refined
 # Sigmas by which stops must prefer a form for it to be told from a simpler one; of one that hangs
 # on more, as little likely among as many covariates as those might have been.
 SIGMAS_APART = 2.0
+# A form is told from another by the sum of what stops prefer it by, over how that scatters among K
+# stops: where it varies by twice its mean, as a gross structure makes it vary, half the root of K
+# at most. With fewer than 4 z^2 stops, which could then never tell z sigmas, covariates are tested.
+SPREAD_OF_STOPS = 4
 MOST_TERMS = 4  # a choice: bounds the time, as each has a whole search; more are read by nobody
 # Smooth functions that are judged before nothing is said to be there, and the sets of covariates,
 # beside the best one, over which forms are tried. Choices: each costs a jackknife, or a search.
@@ -174,7 +178,8 @@ def _step(
     def lacks(simpler: Form, best: Form) -> bool:
         """Whether a covariate of the best form stands out beside a simpler one, where stops confirm
         a smooth function of its covariates: a form may live on few beams."""
-        if not (further := _further(simpler, best)):
+        further = _further(simpler, best)
+        if not further or len(best.left) > SPREAD_OF_STOPS * _sigmas_apart(count, further) ** 2:
             return False
         smooth = over[best]
         known = judged(smooth.covariates, smooth.plain).p_value()
@@ -280,7 +285,7 @@ def simplest(
         covariates: how many there are.
         lacks: whether the best form, the second, says more than a simpler one by a test of its own:
             few stops differ so much in what a gross structure does to each that the first test can
-            tell nothing apart, as its ratio is never more than the root of their number.
+            tell nothing apart (`SPREAD_OF_STOPS`).
     """
     best = {frozenset(f.term.covariates): f for f in reversed(found)}
     both = [(f, {found[0], best[frozenset(f.term.covariates)]}) for f in found]
@@ -293,7 +298,7 @@ def simplest(
 
 def _told_apart(form: Form, best: Form, covariates: int) -> bool:
     worse = (form.left - best.left)[best.left > 0.0]
-    limit = -float(special.ndtri(_tail_apart(covariates, _further(form, best))))
+    limit = _sigmas_apart(covariates, _further(form, best))
     if form is best or worse.sum() <= limit**2:
         return False
     scatter = np.sqrt(len(worse) * np.var(worse, ddof=1)) if len(worse) > 1 else np.inf
@@ -308,6 +313,11 @@ def _further(form: Form, best: Form) -> int:
 def _tail_apart(covariates: int, further: int) -> float:
     """How often chance alone may tell a form from one of so many covariates less."""
     return float(special.ndtr(-SIGMAS_APART) / max(covariates, 1) ** further)
+
+
+def _sigmas_apart(covariates: int, further: int) -> float:
+    """How many sigmas that is."""
+    return -float(special.ndtri(_tail_apart(covariates, further)))
 
 
 def _best_factors(
