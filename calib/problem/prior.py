@@ -22,11 +22,13 @@ class JointPrior:
         held: the variables, in the order of the covariance.
         means: their earlier values.
         covariance: (P, P) of their tangents.
+        freed: the variables that may have moved since.
     """
 
     held: Sequence[Unknown]
     means: Mapping[str, np.ndarray]
     covariance: np.ndarray
+    freed: frozenset[str] = frozenset()
 
     name = "prior"
     kind = "prior"
@@ -65,7 +67,7 @@ class JointPrior:
         """The same, where some variables have since moved by as many times their own sigma."""
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
-        return JointPrior(self.held, self.means, covariance)
+        return JointPrior(self.held, self.means, covariance, self.freed | freed.keys())
 
     @cached_property
     def _root(self) -> np.ndarray:

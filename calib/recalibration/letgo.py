@@ -52,7 +52,9 @@ def let_go(
     repeated with these let go, until one finds what it let go. So are links of which one may have
     moved in their place, as their estimates are no surer. Where fits find in turn what another let
     go, the last lets go what any two of them did. Residuals that then exceed their sigmas are due
-    to something else: what seems to move because of that is held again.
+    to something else: what seems to move because of that is held again. Where half or more of the
+    beams were rejected that one ring acts on, say, that may be because it was held: then the first
+    fit is one with it let go.
 
     Args:
         prior: the earlier solution.
@@ -64,6 +66,9 @@ def let_go(
     free, last = {}, False
     if not (now := fit(prior)).converged:
         free, now = _from_afar(prior, fit)
+    elif now.unheard:
+        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in now.unheard}
+        now = fit(prior.loosened(free))
     while True:
         held = prior.loosened(free)
         found = _Moves.of(prior, NewerData.of(held, now), limit).free

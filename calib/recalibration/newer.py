@@ -15,6 +15,7 @@ from calib.problem.unknowns import Unknown
 # Of the earlier variance left: less than that, and the new data say something. A choice: they took
 # 5 % off the earlier sigma.
 LEFT_VARIANCE = 0.9
+TESTS_OF_MEMBERS = ("all", "their mean", "each")  # of unknowns with a value for each ring, say
 
 
 class RefittedPrior(NamedTuple):
@@ -23,7 +24,8 @@ class RefittedPrior(NamedTuple):
     ``change`` (P,) is now minus then, as a tangent there; ``graph`` and ``covariance`` (P, P) say
     how well it is known now, as rows that err alone have it and as its intervals have it; and
     ``widened`` (P, P) as they have it where residuals exceed their sigmas; None where they do not.
-    Of a fit that has not ``converged`` none of this says anything.
+    Of a fit that has not ``converged`` none of this says anything, nor of what is ``unheard``: half
+    or more of the beams that a parameter of it acts on were rejected.
     """
 
     change: np.ndarray
@@ -31,6 +33,7 @@ class RefittedPrior(NamedTuple):
     covariance: np.ndarray
     widened: np.ndarray | None = None
     converged: bool = True
+    unheard: frozenset[str] = frozenset()
 
     @property
     def at_least(self) -> RefittedPrior:
@@ -104,8 +107,9 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
     nothing moved, ``d = now - m ~ N(0, V)``, ``V = S - S_now`` and what rows that err together add
     to S_now; with P = S^-1, link k alone having moved shows in ``T = (P d)_k^T [(P V P)_kk]^-1
     (P d)_k``, chi2-distributed if it has not. Links are strongly correlated, so the change of each
-    by itself would accuse the wrong one. Of many rings that changed alike T says little: there the
-    mean is tested too, and the smaller p-value of the two is doubled.
+    by itself would accuse the wrong one. Of many rings T says little where they changed alike, or
+    one alone did: there the mean and each one are tested, too. Three times the smallest p-value of
+    these counts, that of single ones times their number (Bonferroni).
 
     Baarda 1968, A testing procedure for use in geodetic networks.
     """
@@ -117,8 +121,10 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
         if v.of_members and v.dim > 1:
             of_all = np.ones((1, v.dim))
             mean = _test(of_all @ block[0], *(of_all @ each @ of_all.T for each in block[1:]))
-            both = [p for p in (found[v.name], mean) if p is not None]
-            found[v.name] = min(1.0, 2.0 * min(both)) if both else None
+            single = [p for p in map(_test, *map(_singly, block)) if p is not None]
+            least = min(single) * len(single) if single else None
+            several = [p for p in (found[v.name], mean, least) if p is not None]
+            found[v.name] = min(1.0, len(TESTS_OF_MEMBERS) * min(several)) if several else None
     return found
 
 
@@ -131,6 +137,11 @@ def _test(pull: np.ndarray, spread: np.ndarray, weight: np.ndarray) -> float | N
         return None
     statistic = float((np.square(axes.T @ root @ pull)[use] / told[use]).sum())
     return float(chdtrc(use.sum(), statistic))
+
+
+def _singly(block: np.ndarray) -> np.ndarray:
+    """Of a pull (P,) or its covariance (P, P), that of each alone: (P, 1) or (P, 1, 1)."""
+    return block[:, None] if block.ndim == 1 else np.diagonal(block)[:, None, None]
 
 
 def blocks_of(variables: Sequence[Unknown]) -> dict[str, slice]:

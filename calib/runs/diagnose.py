@@ -90,11 +90,13 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
-    found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
     between = list(moved_between(stand, found.looks[-1].stand, progress))
-    if between:  # what moved once, between two recordings, seems to scatter, or contradicts all
+    if between:
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
-        found, suspect = replace(found, chance=(), **kept), []
+        found, suspect = replace(_of_one_rig(found), **kept), []
+    found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
+    if between:
+        found, formulas = _of_one_rig(found), Unnamed()
     rooms = rooms_turned(stand.problem, stand.estimate.values)
     result = conclude(
         found,
@@ -137,6 +139,13 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         ],
         command=_command(run, result),
     )
+
+
+def _of_one_rig(found: Search) -> Search:
+    """A search where something moved between two recordings: that seems to scatter, and has
+    structure over whatever differs between the two, as a day's temperature does. What is there
+    besides, fits of each recording alone tell."""
+    return replace(found, chance=(), unnamed=(), at_first=())
 
 
 def _answer(

@@ -17,6 +17,7 @@ import numpy as np
 from calib.linear.layout import StopKey, key_of
 from calib.linear.parallel import over_stops
 from calib.outputs.journal import Answer
+from calib.problem.prior import JointPrior
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
@@ -325,11 +326,14 @@ class Loop(Descent):
 
     def begin_rejected(self) -> bool:
         """Take parameters half or more of whose beams have no weight to where these would have
-        them, if the cost is lower there; whether any moved. What an earlier run tells of stays."""
+        them, if the cost is lower there; whether any moved. What an earlier run tells of stays, if
+        it cannot have moved."""
+        freed = (prior.freed for prior in self.prior if isinstance(prior, JointPrior))
+        stay = self.held.difference(*freed)
 
         def compute() -> Answer:
             here = self.problem, self.values, self.associations
-            return anew(*here, {n: x for n, x in rejected(*here).items() if n not in self.held})
+            return anew(*here, {n: x for n, x in rejected(*here).items() if n not in stay})
 
         moved = self.journal.answer({**self.values, "": "rejected"}, compute)
         if moved:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import chdtrc
 from scipy.stats import kstest
 
 from calib.problem.prior import JointPrior
@@ -192,13 +193,21 @@ def test_a_ring_that_changed_by_itself_is_told_by_itself():
     assert np.argmax(np.abs(link.change) / link.sigma) == 5
 
 
+def test_one_ring_among_many_is_not_lost_in_them():
+    """A change of 6.4 sigmas of one of 64 is little for all of them together."""
+    worlds = [rings_then_and_now(9.0 * np.eye(64)[5], seed) for seed in range(20)]
+    together = [chdtrc(64, np.square(data.right).sum() / 2.0) for _, data in worlds]
+    assert np.median(together) > 1e-4
+    assert np.median([p_values_of(*world)["rings"] for world in worlds]) < 1e-6
+
+
 def test_half_of_the_rings_are_not_all():
     """Though their mean has changed as well."""
     links = [link_of_rings(np.repeat([3.0, 0.0], 32), seed) for seed in range(5)]
     assert all(link.moved and not link.of_mean for link in links)
 
 
-def test_two_looks_at_rings_alarm_no_more_often_than_one():
+def test_several_looks_at_rings_alarm_no_more_often_than_one():
     worlds = (rings_then_and_now(np.zeros(64), seed) for seed in range(600))
     p = np.array([p_values_of(*world)["rings"] for world in worlds])
     for level in (0.02, 0.1):
