@@ -23,6 +23,7 @@ FAR_OFF = 3.0
 # Of frames few moves from CAD are checked by anything: beyond this chance puts 6 of them in one rig
 # of a hundred, and 17, as of an arm with two bodies, in one of 10,000.
 TOLERATED_OF_CAD = 1.7
+LEAST_OF_A_RIG = 2  # links: a choice; of rigs with fewer a body that was knocked is most of it
 OVER = "the held-out error is {:.1f} times as large as expected"
 
 
@@ -70,7 +71,17 @@ def cautions(run: Run) -> list[str]:
         out.append(OVER.format(times))
     out += run.summary.get("odd", ())  # which runs of earlier versions lack
     told = [*together_told(run.summary), *standing_out(run.summary)]
-    return [*out, *_rings(run, bad=False), *told]
+    return [*out, *_rings(run, bad=False), *told, *_another_rig(run)]
+
+
+def _another_rig(run: Run) -> list[str]:
+    """That most of what an earlier run knew is otherwise now, as of another rig."""
+    links = [link for link in run.summary.get("links") or () if link["p_value"] is not None]
+    moved = [link["name"] for link in links if link["moved"]]
+    if len(moved) <= max(len(links) / 2, LEAST_OF_A_RIG):
+        return []
+    what = f"{len(moved)} of {len(links)} links moved since the earlier run"
+    return [f"{what}: was that a run of this rig?"]
 
 
 def forbids(run: Run) -> list[str]:

@@ -1,11 +1,13 @@
 """One ring's range zero that changed since an earlier run, which knows it well."""
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from calib.runs.belief import _another_rig
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 
@@ -30,6 +32,16 @@ def with_ring_longer(folder, by_m):
         table[["x", "y", "z"]] = xyz.astype(np.float32)
         table.to_parquet(path, index=False)
     return folder
+
+
+@pytest.mark.parametrize(("moved", "told"), [(0, 9), (4, 9), (5, 9), (2, 2), (7, 9)])
+def test_where_most_links_moved_it_is_asked_whether_it_is_the_same_rig(moved, told):
+    links = [{"name": f"l{i}", "moved": i < moved, "p_value": 0.5} for i in range(told)]
+    untold = {"name": "unseen", "moved": False, "p_value": None}
+    asked = _another_rig(SimpleNamespace(summary={"links": [*links, untold]}))
+    said = [f"{moved} of {told} links moved since the earlier run: was that a run of this rig?"]
+    assert asked == (said if moved > 4 else [])
+    assert not _another_rig(SimpleNamespace(summary={"links": None}))
 
 
 @pytest.mark.slow
