@@ -14,6 +14,7 @@ from calib.problem.unknowns import Unknown
 from calib.recalibration.links import Link
 from calib.recalibration.newer import NewerData, RefittedPrior, blocks_of, tests
 from calib.recalibration.odds import FREEDOMS, MoveOdds
+from chains.errors import NothingMetError
 
 ALARM = 0.01  # chance that anything is called moved when nothing has
 # Odds by which one link explains better than another, from which on it is named alone: "strong"
@@ -64,7 +65,8 @@ def let_go(
     limit = alarm / len(prior.held)
     fits: list[dict[str, float]] = []
     free, last = {}, False
-    if not (now := fit(prior)).converged:
+    now = _where_anything_is_met(prior, fit)
+    if now is None or not now.converged:
         free, now = _from_afar(prior, fit)
     elif now.unheard:
         free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in now.unheard}
@@ -88,6 +90,16 @@ def let_go(
         free = moves.free
         fit(prior.loosened(free))
     return _links(prior, data, moves, free)
+
+
+def _where_anything_is_met(
+    prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior]
+) -> RefittedPrior | None:
+    """A fit from a prior; None where beams would meet nothing there."""
+    try:
+        return fit(prior)
+    except NothingMetError:
+        return None
 
 
 def _from_afar(

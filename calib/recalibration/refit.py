@@ -34,10 +34,12 @@ def solve_from(
     see `let_go` and `shapes_freed`.
     """
     found: list[_Fit] = []
+    first: list[_Fit] = []  # of the prior as it is, with which `let_go` begins, and may end
 
     def fit(held: JointPrior) -> RefittedPrior:
-        again = found and held is prior  # with which `let_go` begins, and may end
-        found.append(found[0] if again else fit_anew(held))
+        found.append(first[0] if first and held is prior else fit_anew(held))
+        if held is prior:
+            first.append(found[-1])
         return found[-1].told
 
     def fit_anew(prior: JointPrior) -> _Fit:
