@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +64,11 @@ class NewerData:
         beyond = weight @ ((now.covariance - now.graph) / both) @ weight
         right = weight @ (now.change / scale)
         return cls((weight - known) / both, right / scale, beyond / both)
+
+    @property
+    def by_single_rows(self) -> NewerData:
+        """The same, where rows err by themselves alone."""
+        return replace(self, beyond=np.zeros_like(self.beyond))
 
     def fitted(self, prior: JointPrior) -> RefittedPrior:
         """A fit to them from another prior of the same means: one step, as all is linear here."""
