@@ -24,7 +24,7 @@ from calib.solve.otherwise.sampled import (
 # grids that are finer by a half each time, until a step is as small as this, rad or m: a scan 4 m
 # from a wall is then off by less than `NEAR_M`, from where passes over the scans find the optimum.
 FINEST_STEP = 0.02
-MOST_AT_ONCE = 3  # joints: of more, the grid of `values_between` is coarser than half a radian
+MOST_AT_ONCE = 3  # joints: of more, the grid has fewer than eight values of each
 
 
 def joints_by_scans(problem: Problem, values: Values) -> dict[str, np.ndarray]:
