@@ -54,11 +54,11 @@ def let_go(
     repeated with these let go, until one finds what it let go. So are links of which one may have
     moved in their place, as their estimates are no surer. Where fits find in turn what another let
     go, the last lets go what any two of them did. Residuals that then exceed their sigmas are due
-    to something else: what seems to move because of that is held again. Where half or more of the
-    beams were rejected that one ring acts on, say, that may be because it was held: then the first
-    fit is one with it let go. What a move leaves of the residuals looks like rows that err
-    together, and hides it, of few stops most of all: so what contradicts where rows err alone is
-    let go, and judged from that fit, at a tenth of the level.
+    to something else: what seems to move because of that is held again. Half or more of a ring's
+    beams, say, may have been rejected because its zero was held: moves are then judged from a fit
+    that lets it go. A move that is held leaves residuals that look like errors common to many rows,
+    and these hide it. So what would have moved if rows erred alone is let go, and judged from that
+    fit at a tenth of the level.
 
     Args:
         prior: the earlier solution.
@@ -71,8 +71,8 @@ def let_go(
     now = _where_anything_is_met(prior, fit)
     if now is None or not now.converged:
         free, now = _from_afar(prior, fit)
-    elif now.unheard:
-        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in now.unheard}
+    elif now.not_trusted:
+        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in now.not_trusted}
         now = fit(prior.loosened(free))
     while True:
         held = prior.loosened(free)

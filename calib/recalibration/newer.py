@@ -24,8 +24,8 @@ class RefittedPrior(NamedTuple):
     ``change`` (P,) is now minus then, as a tangent there; ``graph`` and ``covariance`` (P, P) say
     how well it is known now, as rows that err alone have it and as its intervals have it; and
     ``widened`` (P, P) as they have it where residuals exceed their sigmas; None where they do not.
-    Of a fit that has not ``converged`` none of this says anything, nor of what is ``unheard``: half
-    or more of the beams that a parameter of it acts on were rejected.
+    Of a fit that has not ``converged`` none of this says anything, nor does it of variables that
+    are ``not_trusted``, as `Estimate.not_trusted` has it.
     """
 
     change: np.ndarray
@@ -33,7 +33,7 @@ class RefittedPrior(NamedTuple):
     covariance: np.ndarray
     widened: np.ndarray | None = None
     converged: bool = True
-    unheard: frozenset[str] = frozenset()
+    not_trusted: frozenset[str] = frozenset()
 
     @property
     def at_least(self) -> RefittedPrior:

@@ -14,7 +14,6 @@ from calib.recalibration.prior import change
 from calib.results.errors import errors_at
 from calib.results.intervals import Intervals, intervals
 from calib.results.sigmas import widened
-from calib.solve.added import rejected
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, shapes_freed, solve
 
@@ -52,14 +51,13 @@ def solve_from(
         moved, turned = change(prior, estimate.values)
         covariances = (held.graph, held.covariance, at_least.covariance)
         graph, covariance, widest = (turned @ each @ turned.T for each in covariances)
-        state = estimate.problem, estimate.values, estimate.associations
         now = RefittedPrior(
             change=moved,
             graph=graph,
             covariance=covariance,
             widened=widest,
             converged=estimate.converged,
-            unheard=frozenset(rejected(*state)) & frozenset(prior.variables),
+            not_trusted=frozenset(estimate.not_trusted) & frozenset(prior.variables),
         )
         return _Fit(now, (estimate, freed, known))
 

@@ -86,7 +86,7 @@ def world(monkeypatch):
             return SimpleNamespace(
                 variables=variables,
                 problem=None,
-                associations=(),
+                not_trusted={},
                 values=values(x),
                 covariance=covariance,
                 information=information,
@@ -99,7 +99,6 @@ def world(monkeypatch):
         monkeypatch.setattr(refit, "shapes_freed", lambda estimate, *_: estimate)
         monkeypatch.setattr(refit, "errors_at", lambda *_: None)
         monkeypatch.setattr(refit, "widened", lambda known, *_: known)
-        monkeypatch.setattr(refit, "rejected", lambda *_: {})
         prior = JointPrior(variables, values(m), then)
         problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
         return {link.name: link for link in refit.solve_from(problem, Model(), prior, None)[-1]}

@@ -3,13 +3,13 @@ stop tells where they were."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.problem.problem import Problem
-from calib.rig.unread import joint_limits, values_between
+from calib.rig.unread import values_between
 from calib.solve.otherwise.orientations import BEST
 from calib.solve.otherwise.sampled import (
     FITS_M,
@@ -38,20 +38,19 @@ def joints_by_scans(problem: Problem, values: Values) -> dict[str, np.ndarray]:
         The unknowns of the joints, by name: where beams are then less than half as far off.
     """
     found: dict[str, np.ndarray] = {}
+    if not any(source.unread for source in problem.sources):
+        return found
+    seen: dict[str | None, set[str]] = {}  # unknown of joints -> those before any body seen there
+    for body in problem.bodies:
+        seen.setdefault(body.stops.noise, set()).update(body.stops.rig.joints_to(body.body))
     for number, scans in sampled_by_recording(problem, values).items():
         unread = problem.sources[number].unread
         for each in scans:
             stop = _Stop(each, values)
-            axes = stop.untold(unread, _seen_beyond(problem, stop.name))
+            axes = stop.untold(unread, seen.get(stop.name, set()))
             if 0 < len(axes) <= MOST_AT_ONCE and (best := stop.best(axes)) is not None:
                 found[stop.name] = best
     return found
-
-
-def _seen_beyond(problem: Problem, name: str | None) -> set[str]:
-    """Joints before any tracked body that is seen at the stop with joints of that name."""
-    at = [b for b in problem.bodies if b.stops.noise == name]
-    return {joint for b in at for joint in b.stops.rig.joints_to(b.body)}
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,8 @@ class _Stop:
         rig, q = self.sampled.scan.stops.rig, self.sampled.scan.stops.joints[0]
         missing = np.isin(np.arange(len(q)), axes)
         tried = values_between(rig, q[None], missing[None])[:, 0] - q
-        lower, upper = joint_limits(rig)
-        step = np.where(missing, (upper - lower) / round(len(tried) ** (1 / len(axes))), 0.0)
+        each = round(len(tried) ** (1 / len(axes)))
+        step = np.ptp(tried[1:], axis=0) / (each - 1)
         beside = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * len(axes)), axis=-1)
         offsets = np.zeros((beside[..., 0].size, len(q)))
         offsets[:, axes] = beside.reshape(-1, len(axes))
@@ -99,10 +98,7 @@ class _Stop:
 
     def _off_m(self, added: np.ndarray) -> np.ndarray:
         """Mean error (G,) of its beams with so much added to its joints (G, J)."""
-        return self.sampled.off_m(np.stack(list(self._placed(added))))
-
-    def _placed(self, added: np.ndarray) -> Iterator[np.ndarray]:
-        """T_reference_lidar (4, 4) with each."""
-        for each in added:
-            values: Mapping[str, np.ndarray] = {**self.values, self.name: each}
-            yield self.sampled.scan.pose(values)
+        scan = self.sampled.scan
+        return self.sampled.off_m(
+            np.stack([scan.pose({**self.values, self.name: each}) for each in added])
+        )
