@@ -1,6 +1,7 @@
 """stops.csv and targets.csv: every cell checked, so that nothing behind them has to ask again."""
 
 import csv
+import hashlib
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,15 @@ class Targets:
     """(M, 3) upper marker of the rod."""
     lower_m: Array
     """(M, 3) lower marker of the rod."""
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Name -> a digest (hex) of all that was measured of it."""
+        rows = np.hstack([self.faro_m, self.upper_m, self.lower_m])
+        return {
+            name: hashlib.sha256(row.tobytes()).hexdigest()
+            for name, row in zip(self.names, rows, strict=True)
+        }
 
 
 class CsvTable:

@@ -316,6 +316,13 @@ class Source:
         return {(group.where, group.what) for group in self.without if group.kind == kind}
 
     @cached_property
+    def measured_targets(self) -> Mapping[str, str]:
+        """Targets of its targets.csv that tie the reference's frame to the tracker's -> a digest of
+        what was measured of each; those that are left out as well."""
+        targets, ties = self.whole.recording.targets, self.rig.target and self.rig.tracker
+        return targets.digests if targets and ties else {}
+
+    @cached_property
     def unread(self) -> frozenset[tuple[str, str]]:
         """Stop and joint of every reading that there is not, as it was left out or never made."""
         stops, names = self.recording.stops, self.rig.joint_names

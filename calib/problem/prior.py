@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,12 +23,15 @@ class JointPrior:
         means: their earlier values.
         covariance: (P, P) of their tangents.
         freed: the variables that may have moved since.
+        rests_on: digests of measurements that the earlier estimate rests on; a fit from it does not
+            count them again, see `Problem.resting_on`.
     """
 
     held: Sequence[Unknown]
     means: Mapping[str, np.ndarray]
     covariance: np.ndarray
     freed: frozenset[str] = frozenset()
+    rests_on: frozenset[str] = frozenset()
 
     name = "prior"
     kind = "prior"
@@ -67,7 +70,7 @@ class JointPrior:
         """The same, where some variables have since moved by as many times their own sigma."""
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
-        return JointPrior(self.held, self.means, covariance, self.freed | freed.keys())
+        return replace(self, covariance=covariance, freed=self.freed | freed.keys())
 
     @cached_property
     def _root(self) -> np.ndarray:

@@ -10,12 +10,13 @@ import numpy as np
 
 from calib.effects import Site
 from calib.forward import Derivatives, Term, Values
-from calib.problem.model import Source
+from calib.problem.model import Source, labels
 from calib.problem.unknowns import Unknown
 from calib.residuals.beams import CellNumbers
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import SeenBody
 from calib.residuals.surfaces import Meeting
+from calib.residuals.targets import HangingTarget
 from calib.residuals.tracker import TrackedBody
 
 
@@ -155,6 +156,27 @@ class Problem:
             for block in self.blocks
         ]
         return replace(self, scans=kept, aside=gone, blocks=blocks)
+
+    def resting_on(self, known: Collection[str]) -> Problem:
+        """The problem for a fit from an earlier one: of targets that the earlier fit rests on, the
+        spheres weigh nothing. What these say of the scanner's frame is known from there.
+
+        Args:
+            known: digests, as of `Source.measured_targets`.
+        """
+        gone = {
+            (label, target)
+            for label, source in zip(labels(self.sources), self.sources, strict=True)
+            for target, digest in source.measured_targets.items()
+            if digest in known
+        }
+        blocks = [
+            block.without_sphere()
+            if isinstance(block, HangingTarget) and block.groups[0].place in gone
+            else block
+            for block in self.blocks
+        ]
+        return replace(self, blocks=blocks) if gone else self
 
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
         """Add an unknown once; it starts at `value`, or at its mean."""

@@ -43,15 +43,18 @@ def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
     """The recordings without what some tokens name; see `Group.token`.
 
     Raises:
-        InputError: a token names nothing that any recording has, or something in several.
+        InputError: a token names nothing that any recording has, or something in several; of a
+            target that several share, measured once, one name means that of all.
     """
     out, called = list(sources), labels(sources)
     for token in tokens:
         every = enumerate(zip(out, called, strict=True))
         found = [(i, g) for i, (s, label) in every for g in _matching(s, label, token)]
+        shared = _sharing_a_target([(out[i], g) for i, g in found], out, called)
+        found = shared or found
         if any(group in out[i].without for i, group in found):
             raise InputError(f"--without {token}: that is left out already; name it once")
-        shared = found and found[0][1].where in (CAD, MESH)
+        shared = shared or (found and found[0][1].where in (CAD, MESH))
         if not found or (len(found) > 1 and not shared):
             raise InputError(_refusal(out, token, [called[i] for i, _ in found]))
         for i, group in found:
@@ -65,6 +68,22 @@ def _matching(source: Source, label: str, token: str) -> list[Group]:
     bare = {token, *(token.removeprefix(f"{n}/") for n in (label, source.recording.folder.name))}
     every = (*source.without, *_groups(source, label))
     return list(dict.fromkeys(g for g in every if g.bare in bare))
+
+
+def _sharing_a_target(
+    found: Sequence[tuple[Source, Group]], sources: Sequence[Source], called: Sequence[str]
+) -> list[tuple[int, Group]]:
+    """Where all that was found is one target, that of every recording that has what was measured of
+    it, by their numbers; else nothing."""
+    digests = {source.measured_targets.get(group.where) for source, group in found}
+    if len(digests) != 1 or None in digests:
+        return []
+    return [
+        (i, replace(found[0][1], where=name, recording=label))
+        for i, (source, label) in enumerate(zip(sources, called, strict=True))
+        for name, digest in source.measured_targets.items()
+        if digest in digests
+    ]
 
 
 def _groups(source: Source, label: str = "") -> list[Group]:

@@ -30,6 +30,8 @@ class _Alone(NamedTuple):
 
     known: Solution | None
     can_fit: bool
+    targets: frozenset[str] = frozenset()
+    """Digests of the targets that it rests on."""
 
 
 def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dict[str, Any]]:
@@ -61,7 +63,7 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
         bad = [label for label, each in alone.items() if each.can_fit and not each.known]
         yield from (told.of_recording(label, first) for label in bad)
         for label in (each for each in mine if each not in (first, *bad)):
-            for link in _since(alone[first].known, model, named[label], alarm, progress):
+            for link in _since(alone[first], model, named[label], alarm, progress):
                 yield _told(first, label, link, f"{rig}/" if len(of_rigs) > 1 else "")
 
 
@@ -86,17 +88,18 @@ def _alone(model: Model, source: Source, progress: Progress) -> _Alone:
         return _Alone(None, can_fit=True)
     seen = errors_at(estimate.problem, estimate.values)
     known = widened(intervals(shapes_freed(estimate, model), progress), estimate, seen)
-    return _Alone(solution_of(problem, estimate, known), can_fit=True)
+    targets = frozenset(source.measured_targets.values())
+    return _Alone(solution_of(problem, estimate, known), can_fit=True, targets=targets)
 
 
 def _since(
-    known: Solution, model: Model, source: Source, alarm: float, progress: Progress
+    first: _Alone, model: Model, source: Source, alarm: float, progress: Progress
 ) -> list[Link]:
-    """The links that moved from what was known to a recording; none where that alone cannot be
+    """The links that moved from what a first recording tells to another; none where this cannot be
     fitted; arguments as of `let_go`."""
     try:
         problem = build([source], model)
-        prior = earlier(problem, known)
+        prior = earlier(problem, first.known, first.targets)
         estimate, _, _, links = solve_from(problem, model, prior, progress, alarm)
     except InputError:
         return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -17,8 +17,13 @@ from chains import se3
 from chains.errors import InputError
 
 
-def earlier(problem: Problem, solution: Solution) -> JointPrior:
+def earlier(problem: Problem, solution: Solution, rests_on: Iterable[str] = ()) -> JointPrior:
     """An earlier solution as a joint prior over those variables that the problem has too.
+
+    Args:
+        problem: of newer recordings.
+        solution: the earlier one.
+        rests_on: digests of the measurements that it rests on.
 
     Raises:
         InputError: the two have nothing in common.
@@ -38,7 +43,8 @@ def earlier(problem: Problem, solution: Solution) -> JointPrior:
             "--prior: that run and these recordings have no frame or effect in common; give a run "
             "of the same rig"
         )
-    return JointPrior(held, means, solution.covariance[np.ix_(rows, rows)])
+    covariance = solution.covariance[np.ix_(rows, rows)]
+    return JointPrior(held, means, covariance, rests_on=frozenset(rests_on))
 
 
 def change(prior: JointPrior, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

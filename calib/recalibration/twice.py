@@ -31,7 +31,8 @@ def all_once(
     known: Sequence[str],
     prior: Path | str | None,
 ) -> list[str]:
-    """Digests (hex) of all that an estimate rests on, each of which counts once.
+    """Digests (hex) of all that an estimate rests on, each of which counts once. Targets that
+    several recordings have may be among them: `build` and `Problem.resting_on` see to these.
 
     Args:
         sources: the recordings, without what is left out.
@@ -68,7 +69,8 @@ def all_once(
                 f"{listed(same)} of {source.recording.folder} already, and data count once; fit "
                 f"without --prior or, for another model of these data, 'rigcal add {prior} EFFECT'"
             )
-    return sorted({*known, *(digest for each in found for digest in each.values())})
+    targets = (digest for source in sources for digest in source.measured_targets.values())
+    return sorted({*known, *targets, *(digest for each in found for digest in each.values())})
 
 
 def _measured(source: Source, scans: Mapping[str, str]) -> dict[str, str]:

@@ -67,6 +67,12 @@ class HangingTarget:
         of_effects = (*self.shift, *self.scanned, *self.tracked)
         return (self.marker, self.gravity, self.reference, *of_effects)
 
+    def without_sphere(self) -> HangingTarget:
+        """The target where its sphere says nothing."""
+        weight = np.ones(len(TARGET_PARTS)) if self.weight is None else self.weight
+        counts = [part != "sphere" for part in TARGET_PARTS]
+        return replace(self, weight=np.where(counts, weight, 0.0))
+
     def scattering(self, of: str, sd: float) -> HangingTarget:
         """The target with another spread beyond the sigma of its sphere, or of its markers."""
         sigma_m = getattr(self, f"sigma_{of}_m")

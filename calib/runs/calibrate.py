@@ -240,7 +240,7 @@ def _fit(
     began, progress = time.monotonic(), staged(progress, FIT)
     before = choices.before
     problem = problems.build(sources, model, progress=progress)
-    held = earlier(problem, before.solution) if before else None
+    held = earlier(problem, before.solution, before.rests_on) if before else None
     links: list[Link] = []
     if held is None:
         estimate = solve(problem, progress=progress, start=start)

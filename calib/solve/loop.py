@@ -87,6 +87,8 @@ class Loop(Descent):
     ) -> None:
         start = start or Start()
         problem = problem.setting_aside(start.aside)
+        if isinstance(prior, JointPrior):
+            problem = problem.resting_on(prior.rests_on)
         problem = with_spread(problem, start.spread(problem))
         super().__init__(problem, prior, progress, values_of(problem, start.state))
         self.given, self.start = self.problem, start

@@ -54,4 +54,4 @@ def prior_of(run: Run, problem: Problem) -> JointPrior | None:
         raise InputError(
             f"{before.folder} has changed since {run.folder} was fitted from it; fit that again"
         )
-    return earlier(problem, before.solution).loosened(freedoms(run.summary))
+    return earlier(problem, before.solution, before.rests_on).loosened(freedoms(run.summary))
