@@ -121,7 +121,7 @@ class PlanningScene:
     @cached_property
     def now(self) -> Information:
         """What the recordings say."""
-        return self._known(*self.together(None))
+        return self.told_by(*self.together(None))
 
     @cached_property
     def _pattern(self) -> tuple[Scan, Beams, float]:
@@ -205,7 +205,7 @@ class PlanningScene:
 
     def after(self, poses: Poses) -> Information:
         """What the recordings and planned stops say together."""
-        return self._known(*self.together(poses))
+        return self.told_by(*self.together(poses))
 
     def together(
         self, poses: Poses | None
@@ -232,17 +232,18 @@ class PlanningScene:
             values[name] = started(unknown, estimate.state, unknown.mean)
         return problem, values, found
 
-    def _known(
+    def told_by(
         self,
         problem: Problem,
         values: Mapping[str, np.ndarray],
         associations: Sequence[Association],
     ) -> Information:
-        return self.believed(of_all(problem, values, associations, self.unbounded))
-
-    def believed(self, found: Information) -> Information:
-        """The same with the earlier estimate, if there is one, in the place of paper."""
-        return found.believing(self.prior) if self.prior else found
+        """What all rows of a problem say, with the earlier estimate, if there is one, in the place
+        of paper; arguments as of `of_all`."""
+        if self.prior is None:
+            return of_all(problem, values, associations, self.unbounded)
+        problem = problem.resting_on(self.prior.rests_on)
+        return of_all(problem, values, associations, self.unbounded).believing(self.prior)
 
     def _with(
         self, poses: Poses, patterns: Sequence[tuple[Scan, Beams]], apart: bool, alone: bool

@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from calib.blunders import told
 from calib.diagnosis.stand import Stand
 from calib.problem import build
@@ -69,7 +67,7 @@ def moved_between(stand: Stand, last: Stand, progress: Progress) -> Iterator[dic
 
 def _told(first: str, later: str, link: Link, rig: str) -> dict[str, Any]:
     """As a blunder, by the parameter, or the mean of them, that shows it best."""
-    best = int(np.argmax(np.abs(link.change) / link.sigma))
+    best = link.parameters.index(link.shown_by)
     way = link.parameters[best], link.change[best], link.sigma[best], link.units[best]
     if link.of_mean:
         way = "all alike", *link.of_mean, link.units[0]

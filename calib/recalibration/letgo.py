@@ -12,7 +12,16 @@ from scipy.special import chdtrc
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 from calib.recalibration.links import Link
-from calib.recalibration.newer import NewerData, RefittedPrior, blocks_of, tests
+from calib.recalibration.newer import (
+    NewerData,
+    RefittedPrior,
+    blocks_of,
+    gained,
+    left_by_moves,
+    shows_best,
+    tests,
+    told_from,
+)
 from calib.recalibration.odds import FREEDOMS, MoveOdds
 from chains.errors import NothingMetError
 
@@ -21,6 +30,7 @@ ALARM = 0.01  # chance that anything is called moved when nothing has
 # evidence (Kass and Raftery 1995, Bayes factors, JASA 90).
 STRONG_ODDS = 20.0
 SECOND_LOOK = 0.1  # of that chance, for what shows only once it is let go (weighted Bonferroni)
+OFF = 3.0  # sigmas, a choice: what is further off than that is wrong, as people read sigmas
 UNLIKE = 0.01  # chance that rings that changed alike are not told to have done so
 # Of one recalibration, until it settles: one where nothing moved, two where data stay as they are.
 MOST_FITS = 4
@@ -96,7 +106,7 @@ def let_go(
     if moves.free.keys() != free.keys():
         free = moves.free
         fit(prior.loosened(free))
-    return _links(prior, data, moves, free)
+    return _links(prior, data, moves, free, limit)
 
 
 def _where_anything_is_met(
@@ -121,17 +131,29 @@ def _from_afar(
 
 
 def _links(
-    prior: JointPrior, data: NewerData, moves: _Moves, free: Mapping[str, float]
+    prior: JointPrior, data: NewerData, moves: _Moves, free: Mapping[str, float], limit: float
 ) -> list[Link]:
     """What became of each link, given which were let go in the fit."""
     held = prior.loosened(moves.moved)
     p_values, now, links = tests(held, data), data.fitted(held), []
+    least, left = told_from(held, data, limit), left_by_moves(held, data)
+    shown_by = {}
     for name in moves.moved:
-        p_values[name] = tests(prior.loosened(_without(moves.moved, name)), data)[name]
+        others = prior.loosened(_without(moves.moved, name))
+        p_values[name] = tests(others, data)[name]
+        shown_by[name] = shows_best(others, data, name)
     for v in prior.held:
         link = _link(v, held, now, p_values[v.name], moves.moved.get(v.name, 0.0))
         instead = tuple(moves.instead.get(v.name, {}))
-        links.append(replace(link, freed=free.get(v.name, 0.0), instead=instead))
+        link = replace(link, freed=free.get(v.name, 0.0), instead=instead)
+        if v.name in shown_by:
+            link = replace(link, shown_by=v.dofs[shown_by[v.name]])
+        if not link.moved and link.p_value is not None:
+            off = v.sigma * left[blocks_of(prior.held)[v.name]]
+            hidden = (least[v.name] > v.sigma) & (off > OFF)
+            unchecked = tuple(n for n, each in zip(v.dofs, hidden, strict=True) if each)
+            link = replace(link, told_from=least[v.name], unchecked=unchecked)
+        links.append(link)
     return links
 
 
@@ -174,13 +196,19 @@ def _instead(
     prior: JointPrior, data: NewerData, moved: Mapping[str, float], limit: float
 ) -> dict[str, dict[str, float]]:
     """Per link that moved those that explain nearly as much in its place, and how free each is;
-    arguments as of `_moved`."""
+    arguments as of `_moved`. A link of many parameters has small odds, as all of them might have
+    moved and most did not. Where it explains as much as the one that is named, by a move no larger
+    in CAD's sigmas, data do not tell them apart."""
     odds, found = MoveOdds.of(prior, data), {}
     for name in moved:
         others, enough = _without(moved, name), odds.gain(moved) - np.log(STRONG_ODDS)
-        beyond = _beyond(prior.loosened(others), data, STRONG_ODDS * limit)
+        held = prior.loosened(others)
+        beyond = _beyond(held, data, STRONG_ODDS * limit)
         ways = {n: odds.freest(others, n) for n in beyond if n not in moved}
-        found[name] = {n: way[n] for n, way in ways.items() if odds.gain(way) > enough}
+        gain = gained(held, data)
+        least = gain[name] - 2.0 * np.log(STRONG_ODDS)
+        alike = {n for n, way in ways.items() if gain[n] > least and way[n] <= moved[name]}
+        found[name] = {n: w[n] for n, w in ways.items() if n in alike or odds.gain(w) > enough}
     return found
 
 

@@ -28,6 +28,11 @@ class Link:
         instead: links of which one may have moved in its place: the data cannot tell.
         of_mean: of what is one quantity of several rings or labels, and has changed alike, the
             change of their mean and the sigma of that; else empty.
+        shown_by: of one that moved, the parameter that explains most had it alone moved.
+        told_from: (n,) of one that has not moved, how far each parameter would have to move by
+            itself to be told; else empty. See `calib.recalibration.newer.told_from`.
+        unchecked: parameters of one that has not moved, of which a move as large as CAD's sigma
+            would not be told, and would leave the estimate more than 3 of its sigmas off.
     """
 
     name: str
@@ -40,6 +45,9 @@ class Link:
     freed: float = 0.0
     instead: tuple[str, ...] = ()
     of_mean: tuple[float, ...] = ()
+    shown_by: str = ""
+    told_from: np.ndarray | tuple[float, ...] = ()
+    unchecked: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
         """As summary.json holds it."""
@@ -54,6 +62,9 @@ class Link:
             "freed": self.freed,
             "instead": self.instead,
             "of_mean": self.of_mean,
+            "shown_by": self.shown_by,
+            "unchecked": self.unchecked,
+            "told_from": [float(x) if np.isfinite(x) else None for x in self.told_from],
         }
 
 

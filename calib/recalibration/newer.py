@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri, chndtrinc
 
+from calib.blunders.chance import POWER
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 
-# Of the earlier variance left: less than that, and the new data say something. A choice: they took
-# 5 % off the earlier sigma.
-LEFT_VARIANCE = 0.9
+# Of the earlier variance left along a direction: more, and the new data say nothing there. Chosen
+# so that alone they would know it 30 times less well. Three times was too little: of one stop, a
+# LiDAR that had moved by millimetres was told as a move of the scanner's frame, or not at all.
+LEFT_VARIANCE = 0.999
 TESTS_OF_MEMBERS = ("all", "their mean", "each")  # of unknowns with a value for each ring, say
 
 
@@ -118,35 +120,127 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
 
     Baarda 1968, A testing procedure for use in geodetic networks.
     """
-    force, blocks, found = Force.of(prior, data), blocks_of(prior.held), {}
-    for v in prior.held:
-        k = blocks[v.name]
-        block = force.pull[k], force.spread[k, k], force.weight[k, k]
-        found[v.name] = _test(*block)
+    found = {}
+    for v, block in _pulls(prior, data):
+        found[v.name] = _test(block)
         if v.of_members and v.dim > 1:
             of_all = np.ones((1, v.dim))
-            mean = _test(of_all @ block[0], *(of_all @ each @ of_all.T for each in block[1:]))
-            single = [p for p in map(_test, *map(_singly, block)) if p is not None]
+            mean = _test(_Pull(of_all @ block[0], *(of_all @ m @ of_all.T for m in block[1:])))
+            single = [p for p in map(_test, block.each) if p is not None]
             least = min(single) * len(single) if single else None
             several = [p for p in (found[v.name], mean, least) if p is not None]
             found[v.name] = min(1.0, len(TESTS_OF_MEMBERS) * min(several)) if several else None
     return found
 
 
-def _test(pull: np.ndarray, spread: np.ndarray, weight: np.ndarray) -> float | None:
-    """The p-value of a pull ~ N(0, spread), along the axes that anything but the prior holds."""
-    root = np.linalg.inv(np.linalg.cholesky(weight))
-    told, axes = np.linalg.eigh(root @ spread @ root.T)
-    use = told > 1.0 - LEFT_VARIANCE
-    if not use.any():
-        return None
-    statistic = float((np.square(axes.T @ root @ pull)[use] / told[use]).sum())
-    return float(chdtrc(use.sum(), statistic))
+def gained(prior: JointPrior, data: NewerData) -> dict[str, float]:
+    """Per link, by how much Akaike's criterion falls where it is let go, or one of its parameters
+    alone: the statistic, as of `tests`, less twice the number of parameters that the data tell and,
+    for that one, as it may be any of n, 2 log n. Half the difference of two links is the logarithm
+    of their odds (Akaike 1974; Burnham and Anderson 2002, 2.9)."""
+    found = {}
+    for v, block in _pulls(prior, data):
+        statistic, dof = block.statistic
+        one = max(each.statistic[0] - 2.0 * each.statistic[1] for each in block.each)
+        found[v.name] = max(statistic - 2.0 * dof, one - 2.0 * np.log(v.dim))
+    return found
 
 
-def _singly(block: np.ndarray) -> np.ndarray:
-    """Of a pull (P,) or its covariance (P, P), that of each alone: (P, 1) or (P, 1, 1)."""
-    return block[:, None] if block.ndim == 1 else np.diagonal(block)[:, None, None]
+def shows_best(prior: JointPrior, data: NewerData, name: str) -> int:
+    """Which parameter of a link explains most, had it alone moved; arguments as of `tests`. All of
+    a link let go, what moved shows in others too, as the data tell them apart."""
+    (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
+    return int(np.argmax([each.statistic[0] for each in block.each]))
+
+
+def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.ndarray]:
+    """Per link, how far (n,) each of its parameters has to move by itself, all else at rest, for
+    `tests` to tell it with a chance of `POWER`; infinite where the data never do.
+
+    A move of size x along a parameter makes the statistic of a test non-central, by x^2 times what
+    the pull's answer to a unit has of its own covariance (Baarda 1968: internal reliability).
+
+    Args:
+        prior, data: as of `tests`.
+        limit: p-value from which on a link has moved.
+    """
+    answer, found = Force.of(prior, data).answer, {}
+    unit, blocks = np.sqrt(np.diag(prior.covariance)), blocks_of(prior.held)
+    for v, block in _pulls(prior, data):
+        k = blocks[v.name]
+        of_each = answer[k, k]
+        if v.of_members and v.dim > 1:
+            share = limit / len(TESTS_OF_MEMBERS)
+            own = zip(block.each, np.diag(of_each), strict=True)
+            alone = [each.told_from(np.array([[by]]), share / v.dim)[0] for each, by in own]
+            least = np.minimum(block.told_from(of_each, share), alone)
+        else:
+            least = block.told_from(of_each, limit)
+        found[v.name] = unit[k] * least
+    return found
+
+
+def left_by_moves(prior: JointPrior, data: NewerData) -> np.ndarray:
+    """By how much (P,) each parameter is off, in its sigmas now, for a unit of a move of its own
+    that nobody tells: the earlier value holds it (external reliability: Baarda 1968)."""
+    now, scale = data.fitted(prior), np.sqrt(np.diag(prior.covariance))
+    both = np.outer(scale, scale)
+    held = (now.graph / both) @ np.linalg.inv(prior.covariance / both)
+    return np.diag(held) / np.sqrt(np.diag(now.covariance))
+
+
+class _Pull(NamedTuple):
+    """How the prior pulls at a link: a pull (n,) ~ N(0, spread) where nothing moved, and the weight
+    (n, n) of the prior there."""
+
+    pull: np.ndarray
+    spread: np.ndarray
+    weight: np.ndarray
+
+    @property
+    def each(self) -> list[_Pull]:
+        """Of its parameters one by one."""
+        of_one = (np.diag(self.spread), np.diag(self.weight))
+        return [
+            _Pull(np.array([p]), *np.array(m)[:, None, None])
+            for p, *m in zip(self.pull, *of_one, strict=True)
+        ]
+
+    @property
+    def statistic(self) -> tuple[float, int]:
+        """That of the test, and its degrees of freedom."""
+        unit = self._units()
+        return float(np.square(unit @ self.pull).sum()), len(unit)
+
+    def told_from(self, answer: np.ndarray, limit: float) -> np.ndarray:
+        """See `told_from`; `answer` (n, n) is by how much a move of each parameter pulls more."""
+        unit = self._units()
+        if not len(unit):
+            return np.full(len(self.pull), np.inf)
+        enough = chndtrinc(chdtri(len(unit), limit), len(unit), 1.0 - POWER)
+        with np.errstate(divide="ignore"):
+            return np.sqrt(enough / np.square(unit @ answer).sum(axis=0))
+
+    def _units(self) -> np.ndarray:
+        """(m, n) that makes it unit noise, along the axes that anything but the prior holds."""
+        root = np.linalg.inv(np.linalg.cholesky(self.weight))
+        told, axes = np.linalg.eigh(root @ self.spread @ root.T)
+        use = told > 1.0 - LEFT_VARIANCE
+        return (axes.T @ root)[use] / np.sqrt(told[use, None])
+
+
+def _pulls(prior: JointPrior, data: NewerData) -> Iterator[tuple[Unknown, _Pull]]:
+    """Every link, and how the prior pulls at it."""
+    force, blocks = Force.of(prior, data), blocks_of(prior.held)
+    for v in prior.held:
+        k = blocks[v.name]
+        yield v, _Pull(force.pull[k], force.spread[k, k], force.weight[k, k])
+
+
+def _test(pull: _Pull) -> float | None:
+    """The p-value; None where nothing but the prior holds the link."""
+    statistic, dof = pull.statistic
+    return float(chdtrc(dof, statistic)) if dof else None
 
 
 def blocks_of(variables: Sequence[Unknown]) -> dict[str, slice]:

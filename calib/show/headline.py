@@ -19,8 +19,8 @@ TOLD_AXES = 3.0  # sigmas of a change, from which the axis along which it went i
 
 class Words(NamedTuple):
     """How a change is told: of a length, of an angle, of an effect; that there is no other, that
-    there is none at all, that nothing is known; what stands above links with and without; and what
-    is asked where everything changed."""
+    there is none at all, that nothing is known; what stands above links with and without; what is
+    asked where everything changed; and what is hardly checked."""
 
     shifted: str
     turned: str
@@ -31,6 +31,7 @@ class Words(NamedTuple):
     title: str
     title_of_none: str
     all_of_them: str = ""
+    hidden: str = ""
 
 
 MOVED_WORDS = Words(
@@ -43,6 +44,7 @@ MOVED_WORDS = Words(
     title="moved since the earlier run",
     title_of_none="not moved",
     all_of_them="nothing that the new data tell of stayed as it was: is it the same rig?",
+    hidden="a move as large as CAD's sigma would not be seen in {}",
 )
 DIFFERS = Words(  # of one recording: nothing moved, two models tell it otherwise
     shifted="differs by",
@@ -79,6 +81,8 @@ def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORD
         out = words.none
     if silent:
         out += f"; {words.silent.format(', '.join(link['name'] for link in silent))}"
+    if hidden := [link["name"] for link in still if link.get("unchecked")]:
+        out += f"; {words.hidden.format(', '.join(hidden))}"
     return f"{out}."
 
 
@@ -106,7 +110,10 @@ def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
     names, change, sigma = link["parameters"], np.array(link["change"]), np.array(link["sigma"])
     of_frame = {"tx", "rx"} <= set(names)
     certain = np.abs(change) > TOLD_AXES * sigma
-    certain[np.argmax(np.abs(change) / sigma)] = True
+    if (best := link.get("shown_by")) in names:
+        certain[names.index(best)] = True
+    elif not certain.any():
+        certain[np.argmax(np.abs(change) / sigma)] = True
     for unit in dict.fromkeys(link["units"][::-1]):
         mine = np.flatnonzero(certain & (np.array(link["units"]) == unit))
         scale, told = shown(unit)

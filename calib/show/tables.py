@@ -17,6 +17,7 @@ from calib.blunders.chance import LEAST_P
 from calib.diagnosis.suggest import span
 from calib.effects import CATALOGUE
 from calib.results.outstanding import shown, standing_out
+from calib.rig.suspect import listed
 from calib.runs.estimates import VariableEstimate, variable_estimates
 from calib.show.headline import MOVED_WORDS, Words, by_what_became, closing, moved_sentence
 from calib.show.misfit import beams_told, misfit_warnings
@@ -319,8 +320,21 @@ def print_links(
         rows = [(link["name"], f"{_change(link)}; {chance(link['p_value'])}") for link in moved]
         print_pairs(console, words.title, rows)
     if still:
-        told = ", ".join(f"{link['name']} ({chance(link['p_value'])})" for link in still)
-        print_pairs(console, words.title_of_none, [("", told)])
+        rows = [(link["name"], f"{chance(link['p_value'])}{_seen_from(link)}") for link in still]
+        print_pairs(console, words.title_of_none, rows)
+
+
+def _seen_from(link: Mapping[str, Any]) -> str:
+    """From what size on a move of a link at rest is seen, in its units, and of which of its
+    parameters one that CAD has hardly is."""
+    texts, known = [], list(zip(link.get("told_from", ()), link["units"], strict=False))
+    for scale, unit in map(shown, dict.fromkeys(unit for _, unit in known)):
+        each = sorted(scale * least for least, u in known if shown(u)[1] == unit and least)
+        ends = dict.fromkeys(f"{float(f'{x:.2g}'):g}" for x in (each[:1] + each[-1:]))
+        texts += [f"{' to '.join(ends)} {unit}".rstrip()] if each else []
+    hardly = listed(link.get("unchecked", ()))
+    seen = f"; seen from {', '.join(texts[::-1])}" if texts else ""
+    return seen + (f"; hardly checked: {hardly}" if hardly else "")
 
 
 def _change(link: Mapping[str, Any]) -> str:

@@ -23,6 +23,7 @@ from chains import se3
 from chains.errors import InputError
 from sensors.documents import read_yaml
 
+from .. import mishaps
 from . import broken, rigs
 
 MODEL = Model(("arm_link_length", "arm_joint_offset", "ring_range_offset"))
@@ -267,6 +268,8 @@ def test_what_cannot_be_left_out_is_said_in_one_sentence(box, tokens, said, rigc
 def test_of_several_recordings_it_is_said_which(box, places, tmp_path):
     """By its folder, with as much of the path as tells it from the others."""
     folders = [shutil.copytree(box, tmp_path / place) for place in places]
+    with mishaps.Scene(folders[1], np.random.default_rng()).sheet("targets.csv") as targets:
+        targets.columns["lower_x"] = [repr(float(x) + 1e-6) for x in targets.columns["lower_x"]]
     sources = [Source.open(folder) for folder in folders]
     with pytest.raises(InputError) as refused:
         leave_out(sources, ["s1:scan"])

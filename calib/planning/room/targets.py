@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.diagnosis.linear import beside
 from calib.linear.layout import Layout
-from calib.planning.information import Information, of_all
+from calib.planning.information import Information
 from calib.planning.room.sight import seen_by_two
 from calib.planning.scene import PlanningScene
 from calib.planning.stops import MARK
@@ -167,9 +167,7 @@ def known_with(scene: PlanningScene, at_m: np.ndarray) -> Information:
     if not len(at_m):
         return scene.now
     problem, values, _ = _with_targets(scene, at_m)
-    return scene.believed(
-        of_all(problem, values, scene.stand.estimate.associations, scene.unbounded)
-    )
+    return scene.told_by(problem, values, scene.stand.estimate.associations)
 
 
 def each_target(scene: PlanningScene, at_m: np.ndarray) -> tuple[Information, np.ndarray]:
@@ -178,7 +176,7 @@ def each_target(scene: PlanningScene, at_m: np.ndarray) -> tuple[Information, np
     weightless = {id(b): replace(b, weight=np.zeros(3)) for b in hung}
     bare = replace(problem, blocks=[weightless.get(id(b), b) for b in problem.blocks])
     met = scene.stand.estimate.associations
-    known = scene.believed(of_all(bare, values, met, scene.unbounded))
+    known = scene.told_by(bare, values, met)
     markers = {n for n, u in problem.variables.items() if u.role is Role.TARGET}
     known = known.onto(np.array([i for i, (n, _) in enumerate(known.keys) if n not in markers]))
     layout = Layout.of(problem, unbounded=scene.unbounded)
