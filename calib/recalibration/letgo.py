@@ -55,6 +55,16 @@ class _Moves(NamedTuple):
         return {n: f for each in self.instead.values() for n, f in each.items()} | self.moved
 
 
+class _Settled(NamedTuple):
+    """What newer data say in the fit with which `let_go` ends, what moved, what was let go there,
+    and what in any fit."""
+
+    data: NewerData
+    moves: _Moves
+    free: dict[str, float]
+    tried: frozenset[str]
+
+
 def let_go(
     prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior], alarm: float = ALARM
 ) -> list[Link]:
@@ -67,30 +77,47 @@ def let_go(
     to something else: what seems to move because of that is held again. Half or more of a ring's
     beams, say, may have been rejected because its zero was held: moves are then judged from a fit
     that lets it go. A move that is held leaves residuals that look like errors common to many rows,
-    and these hide it. So what would have moved if rows erred alone is let go, and judged from that
-    fit at a tenth of the level.
+    and these hide it. So where nothing has moved, what would have if rows erred alone is let go,
+    and judged from that fit at a tenth of the level.
 
     Args:
         prior: the earlier solution.
         fit: from it, or from the same where links were let go, to the newer data.
         alarm: chance that any link is called moved where none has.
     """
-    limit = alarm / len(prior.held)
-    fits: list[dict[str, float]] = []
-    free, last = {}, False
-    now = _where_anything_is_met(prior, fit)
-    if now is None or not now.converged:
-        free, now = _from_afar(prior, fit)
-    elif now.not_trusted:
-        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in now.not_trusted}
-        now = fit(prior.loosened(free))
-    while True:
-        held = prior.loosened(free)
-        data = NewerData.of(held, now)
-        found = _Moves.of(prior, data, limit).free
-        if not (found or free or fits):
+    limit, free = alarm / len(prior.held), {}
+    first = _where_anything_is_met(prior, fit)
+    if first is None or not first.converged:
+        free, first = _from_afar(prior, fit)
+    elif first.not_trusted:
+        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in first.not_trusted}
+        first = fit(prior.loosened(free))
+    settled = _settled(prior, fit, free, first, limit)
+    if not (free or settled.moves.free):
+        by_rows = NewerData.of(prior, first).by_single_rows
+        hidden = _Moves.of(prior, by_rows, SECOND_LOOK * limit).free
+        if hidden.keys() - settled.tried:
             limit *= SECOND_LOOK
-            found = _Moves.of(prior, data.by_single_rows, limit).free
+            settled = _settled(prior, fit, hidden, fit(prior.loosened(hidden)), limit)
+    return _links(prior, settled, limit)
+
+
+def _settled(
+    prior: JointPrior,
+    fit: Callable[[JointPrior], RefittedPrior],
+    free: dict[str, float],
+    now: RefittedPrior,
+    limit: float,
+) -> _Settled:
+    """Where fits end, of which the first, `now`, let some links go; arguments as of `let_go`."""
+
+    def held() -> JointPrior:
+        return prior.loosened(free) if free else prior
+
+    fits: list[dict[str, float]] = []
+    last = False
+    while True:
+        found = _Moves.of(prior, NewerData.of(held(), now), limit).free
         if last or _alike(found, free):
             break
         fits.append(free)
@@ -99,14 +126,15 @@ def let_go(
         if last and _alike(both, free):
             break
         free = both if last else found
-        now = fit(prior.loosened(free))
+        now = fit(held())
         last = last or not now.converged
-    data = NewerData.of(held, now.at_least)
+    tried = frozenset(name for each in (*fits, free) for name in each)
+    data = NewerData.of(held(), now.at_least)
     moves = _Moves.of(prior, data, limit)
     if moves.free.keys() != free.keys():
         free = moves.free
-        fit(prior.loosened(free))
-    return _links(prior, data, moves, free, limit)
+        fit(held())
+    return _Settled(data, moves, free, tried)
 
 
 def _where_anything_is_met(
@@ -130,10 +158,9 @@ def _from_afar(
     return (every, now) if now.converged else ({}, fit(prior))
 
 
-def _links(
-    prior: JointPrior, data: NewerData, moves: _Moves, free: Mapping[str, float], limit: float
-) -> list[Link]:
-    """What became of each link, given which were let go in the fit."""
+def _links(prior: JointPrior, settled: _Settled, limit: float) -> list[Link]:
+    """What became of each link, given where fits end; arguments as of `_settled`."""
+    data, moves, free, _ = settled
     held = prior.loosened(moves.moved)
     p_values, now, links = tests(held, data), data.fitted(held), []
     least, left = told_from(held, data, limit), left_by_moves(held, data)

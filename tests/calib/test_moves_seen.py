@@ -118,3 +118,24 @@ def test_what_is_hardly_checked_is_said():
     assert not zeros.moved and zeros.unchecked == ("zeros_1",) and rest.unchecked == ()
     sure, blind = zeros.told_from
     assert 0.2 < sure < 0.6 and blind > 1.0
+
+
+def test_a_move_hidden_by_its_residuals_is_found_where_another_seemed_to_be_the_one():
+    """What the residuals of a held move widen leaves the wrong link; let go, that has not moved."""
+    links = [linked("wrong", [1.0]), linked("hidden", [1.0])]
+    prior = JointPrior(links, {}, 1e-4 * np.eye(2))
+    asked = []
+
+    def fit(held):
+        free = tuple(
+            link.name for link, s in zip(links, np.diag(held.covariance), strict=True) if s > 0.1
+        )
+        asked.append(free)
+        at = [0.0 if free else 0.05, 0.06]
+        wide = np.diag([0.0, 0.0 if "hidden" in free else 1e10])
+        return NewerData(1e6 * np.eye(2), 1e6 * np.array(at), wide).fitted(held)
+
+    wrong, hidden = let_go(prior, fit)
+    assert hidden.moved and not wrong.moved and wrong.freed == 0.0
+    assert asked[:3] == [(), ("wrong",), ()] and asked[-1] == ("hidden",)
+    assert hidden.change == pytest.approx([0.06], abs=1e-3)
