@@ -54,7 +54,7 @@ class CsvTable:
     """A CSV table whose columns are taken one by one, each checked; `rest` gives the others."""
 
     def __init__(self, path: Path, key: str, text: Sequence[str] = ()) -> None:
-        self.path = path
+        self.path, self._key = path, key
         self._columns = read_csv(path, text=(key, *text))
         self._names = self.text(key).tolist()
 
@@ -64,7 +64,7 @@ class CsvTable:
     def names(self) -> list[str]:
         """Take the names of the rows: at least one row, no empty name, none twice."""
         if not self._names:
-            raise InputError(f"{self.path} has no rows; it needs one per stop")
+            raise InputError(f"{self.path} has no rows; it needs one per {self._key}")
         seen: set[str] = set()
         for row, name in enumerate(self._names):
             if not is_file_name(name):

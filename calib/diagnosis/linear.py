@@ -95,6 +95,14 @@ class Linear:
     looked: int = 0
     beams: int = 0
 
+    @property
+    def beams_drawn(self) -> list[str]:
+        """How many of the beams what is missing was looked for in, if not in all: a sentence."""
+        if self.looked == self.beams:
+            return []
+        share = f"{self.looked:,} of {self.beams:,} beams"
+        return [f"What is missing was looked for in {share}, drawn evenly from every surface."]
+
     def among(self, names: Sequence[str]) -> np.ndarray:
         """Columns of some unknowns among the S, in the order given."""
         return np.concatenate([self.at[name] for name in names])

@@ -18,10 +18,12 @@ from sensors.stops import Targets
 
 # A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
+FEWEST_TARGETS = 3  # targets that fix a pose
 APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
 # Of how far spheres lie apart, what is left where they are mirrored: a choice. All of 0.27 m but
 # 1 mm went where they were.
 LEFT_MIRRORED = 0.2
+NUMBERED, HANDEDNESS = "numbering", "handedness"  # of targets, what puts all of them right at once
 UPWARDS = 0.9  # a choice, of the cosine: scanners are level to a degree, and have z up
 SIGNIFICANT = 5.0  # sigmas of a ratio of lengths
 # In a metre.
@@ -34,6 +36,18 @@ LENGTH_UNITS = {
 NEAR_A_UNIT = 0.03  # of a factor, by which a ratio may miss it
 FARTHER = 30.0  # rooms are at most so many times as large as what is seen of them
 ROOM_ACROSS = 2.5  # times the distance of their walls, rooms are across from corner to corner
+
+
+def mixed_up(targets: Targets, spec: TargetSpec) -> list[Suspect]:
+    """What of `odd_targets` puts all targets that are whole right at once: other numbers, or the
+    other hand."""
+    parts = targets.faro_m, targets.upper_m, targets.lower_m
+    whole = np.isfinite(np.hstack(parts)).all(axis=1)
+    if whole.sum() < FEWEST_TARGETS:
+        return []
+    names = [name for name, kept in zip(targets.names, whole, strict=True) if kept]
+    odd = odd_targets(Targets(names, *(part[whole] for part in parts)), spec)
+    return [s for s in odd if isinstance(s, Suspect) and s.name in (NUMBERED, HANDEDNESS)]
 
 
 def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
@@ -66,14 +80,15 @@ def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:
     if off_m.max() > APART_M and (order := _renumbered(sphere_m, targets.faro_m)) is not None:
         other = np.flatnonzero(order != np.arange(len(order)))
         pairs = ", ".join(f"{names[order[k]]} is the tracker's {names[k]}" for k in other)
-        yield f"scanner and tracker number targets otherwise: the scanner's {pairs}"
+        said = f"scanner and tracker number targets otherwise: the scanner's {pairs}"
+        yield Suspect("target", NUMBERED, said)
     elif off_m.max() > APART_M and mirrored_m < min(APART_M, LEFT_MIRRORED * off_m.max()):
         said = (
             f"tracker and scanner place all targets within {max(1e3 * mirrored_m, 1.0):.0f} mm if "
             f"one of the two is mirrored, and up to {1e3 * off_m.max():.0f} mm apart as they are: "
             "are the tracker's coordinates left-handed, or two of their columns exchanged?"
         )
-        yield Suspect("target", "handedness", said)
+        yield Suspect("target", HANDEDNESS, said)
     elif differing is not None and not askew.any():
         yield differing
     elif off_m.max() > APART_M:

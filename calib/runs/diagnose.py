@@ -12,9 +12,9 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
+from calib.blunders.mixed import mixed_targets
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
-from calib.diagnosis.linear import Linear
 from calib.diagnosis.rejects import Rejects, rejects
 from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
@@ -90,14 +90,14 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
-    between = list(moved_between(stand, found.looks[-1].stand, progress))
+    between = () if run.converged else tuple(mixed_targets(stand.sources))
+    between = between or tuple(moved_between(stand, found.looks[-1].stand, progress))
     if between:
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
         found, suspect = replace(_of_one_rig(found), **kept), []
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
     if between:
         found, formulas = _of_one_rig(found), Unnamed()
-    rooms = rooms_turned(stand.problem, stand.estimate.values)
     result = conclude(
         found,
         falls,
@@ -109,7 +109,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
             *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
             *_not_as_drawn(run, found),
             *(told.of_scan(s, shown_by_no_other([s])) for s in seen_alone(stand.estimate)),
-            *(told.of_room(r.frame, r.sentence) for r in rooms if r.is_better),
+            *_rooms(stand),
             *between,
         ],
         formulas,
@@ -134,11 +134,17 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
             *hardly_checked(unseen),
             *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
             *map(told.whole, _cautions(run, result, last)),
-            *_beams_drawn(found.looks[0].linear),
+            *found.looks[0].linear.beams_drawn,
             *run.omissions,
         ],
         command=_command(run, result),
     )
+
+
+def _rooms(stand: Stand) -> Iterator[dict[str, Any]]:
+    """Rooms that a guess has the wrong way round, as blunders."""
+    rooms = rooms_turned(stand.problem, stand.estimate.values)
+    yield from (told.of_room(r.frame, r.sentence) for r in rooms if r.is_better)
 
 
 def _of_one_rig(found: Search) -> Search:
@@ -264,14 +270,6 @@ def _noisier(run: Run, stand: Stand, explained: bool) -> list[str]:
     if not noisier or max(stand.beams.alone, 0.0 if explained else stand.beams.times) <= TOLERATED:
         return []
     return [stand.beams.sentence]
-
-
-def _beams_drawn(linear: Linear) -> list[str]:
-    """How many of the beams what is missing was looked for in, if not in all."""
-    if linear.looked == linear.beams:
-        return []
-    share = f"{linear.looked:,} of {linear.beams:,} beams"
-    return [f"What is missing was looked for in {share}, drawn evenly from every surface."]
 
 
 def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:

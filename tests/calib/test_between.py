@@ -85,3 +85,21 @@ def test_a_recording_that_fits_nothing_by_itself_is_named(home, tmp_path):
     (bad,) = diagnose(run).blunders
     assert (bad["kind"], bad["recording"]) == ("recording", "after")
     assert bad["sentence"].startswith("A fit to after alone comes to no optimum, and one to before")
+
+
+def test_spheres_under_each_others_names_are_what_is_wrong_and_nothing_that_they_drag_along(
+    home, tmp_path
+):
+    one = shutil.copytree(home / "before", tmp_path / "one")
+    with Scene(one, np.random.default_rng()).sheet("targets.csv") as targets:
+        for name in (f"faro_{axis}" for axis in "xyz"):
+            column = targets.columns[name]
+            column[1], column[3] = column[3], column[1]
+        first, second = (targets.columns["target"][i] for i in (1, 3))
+    run = fit(one, tmp_path / "run", hold_out="none")
+    assert not run.converged
+    found = diagnose(run)
+    (blunder,) = found.blunders
+    assert (found.verdict, blunder["kind"], blunder["without"]) == ("bad_data", "target", None)
+    assert f"the scanner's {second} is the tracker's {first}" in blunder["sentence"]
+    assert found.sentences[1] == blunder["sentence"]

@@ -307,7 +307,7 @@ def test_lengths_that_differ_between_tracker_and_scanner(sound, factor, words):
     swapped = targets.faro_m[[1, 0, *range(2, len(targets.names))]]
     if words is None:
         names = targets.names
-        found = only(odd_targets(replace(targets, faro_m=swapped), rig.target))
+        found = only(odd_targets(replace(targets, faro_m=swapped), rig.target)).sentence
         one, other = names[:2]
         assert (
             f"the scanner's {other} is the tracker's {one}, {one} is the tracker's {other}" in found
@@ -318,7 +318,7 @@ def test_targets_that_both_number_otherwise(sound):
     """Or of which one lies elsewhere, which no other order sets right."""
     rig, recording = sound
     targets, order = recording.targets, np.roll(np.arange(len(recording.targets.names)), 1)
-    found = only(odd_targets(replace(targets, faro_m=targets.faro_m[order]), rig.target))
+    found = only(odd_targets(replace(targets, faro_m=targets.faro_m[order]), rig.target)).sentence
     assert found.startswith("scanner and tracker number targets otherwise: the scanner's ")
     here = [targets.names[k] for k in np.argsort(order)]  # where the scanner has each of them now
     assert all(

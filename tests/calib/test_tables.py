@@ -186,24 +186,20 @@ def test_what_moved_is_told_from_what_did_not(run, printed):
         link("ring_range_offset", True, 2e-5, many, ["m"] * 16),
         link("mount", False, 0.41)
         | {"told_from": [2e-4, 2e-4, None, 5e-4, 1.234, 1e-3], "unchecked": ["ty"]},
-        link("base_markers", False, 0.2),  # of a run of an earlier version
-        link("arm_base", False, None),
+        *(link("base_markers", False, 0.2), link("arm_base", False, None)),  # of an older run
     ]
     lines = printed(tables.print_run, replace(run, summary=SUMMARY | {"links": links}))
     text = " ".join(lines)
     assert "tx +1.23 ± 0.45, ty -4.56 ± 0.12, tz +0.000 ± 0.021 mm; rx +1.20 ± 0.40" in text
     assert "mrad; p < 1e-06" in text
     assert "16 values by 3.00 rms mm; p = 2e-05" in text
-    seen = "seen from 0.5 to 1200 mm, 0.2 mrad; hardly checked: ty"
-    assert f"not moved mount p = 0.41; {seen} base_markers p = 0.2" in text
+    seen = "p = 0.41; seen from 0.5 to 1200 mm, 0.2 mrad; hardly checked: ty"
+    assert f"not moved mount {seen} base_markers p = 0.2" in text
     assert "lidar moved -4.56 ± 0.12 mm in y and turned -3.40 ± 0.50 mrad about y; ring" in text
     assert "changed by 3.00 mm rms; nothing else moved; the new data do not determine" in text
     assert "arm_base; a move as large as CAD's sigma would not be seen in mount." in text
-
-
-def test_nothing_moved_is_said(run, printed):
-    text = " ".join(printed(tables.print_run, replace(run, summary=SUMMARY | {"links": []})))
-    assert "nothing moved significantly." in text
+    none = " ".join(printed(tables.print_run, replace(run, summary=SUMMARY | {"links": []})))
+    assert "nothing moved significantly." in none
 
 
 def test_comparison_has_an_entry_per_run(run, tmp_path):
