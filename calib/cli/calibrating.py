@@ -53,7 +53,10 @@ def simulate(
     out: Out,
     seed: Annotated[int, typer.Option(help="Same seed, same recording.")] = 0,
     hide: Annotated[
-        list[str] | None, typer.Option(metavar="EFFECT=SIZE", help="An effect to hide in it.")
+        list[str] | None,
+        typer.Option(
+            metavar="EFFECT=SIZE", help="An effect to hide in it, as many times its usual size."
+        ),
     ] = None,
     trust: Trust = None,
     as_json: Json = False,

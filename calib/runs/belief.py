@@ -71,7 +71,7 @@ def cautions(run: Run) -> list[str]:
         out.append(OVER.format(times))
     out += run.summary.get("odd", ())  # which runs of earlier versions lack
     told = [*together_told(run.summary), *standing_out(run.summary)]
-    return [*out, *_rings(run, bad=False), *told, *_another_rig(run)]
+    return [*out, *_rings(run, bad=False), *told, *_another_rig(run), *_not_asked(run)]
 
 
 def _another_rig(run: Run) -> list[str]:
@@ -82,6 +82,17 @@ def _another_rig(run: Run) -> list[str]:
         return []
     what = f"{len(moved)} of {len(links)} links moved since the earlier run"
     return [f"{what}: was that a run of this rig?"]
+
+
+def _not_asked(run: Run) -> list[str]:
+    """That something moved since a run which nobody asked what its model lacks: that may be it."""
+    moved = any(link["moved"] for link in run.summary.get("links") or ())
+    if not moved or run.summary.get("prior_diagnosed", True):  # which older runs lack
+        return []
+    return [
+        "the earlier run was not diagnosed, and what its model lacks may seem to have moved; "
+        f"'rigcal diagnose {run.prior}' looks for that"
+    ]
 
 
 def forbids(run: Run) -> list[str]:
