@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from calib.blunders.told import otherwise, whole
-from calib.problem.model import Source
+from calib.problem.model import Source, labels
 from calib.rig.scale import mixed_up
 
 
@@ -15,10 +15,11 @@ def mixed_targets(sources: Sequence[Source]) -> Iterator[dict[str, Any]]:
     """Targets that scanner and tracker number otherwise, or see as in a mirror, as blunders of
     `diagnosis.json`; of several recordings that share them, once."""
     said: set[str] = set()
-    for source in sources:
+    for label, source in zip(labels(sources), sources, strict=True):
         targets, spec = source.recording.targets, source.rig.target
         for each in mixed_up(targets, spec) if targets and spec else ():
             where = str(source.recording.folder / "targets.csv")
             if each.sentence not in said:
                 said.add(each.sentence)
-                yield otherwise("target", each.name, where, whole(f"{where}: {each.sentence}"))
+                found = otherwise("target", each.name, where, whole(f"{where}: {each.sentence}"))
+                yield found | {"recording": label or None}

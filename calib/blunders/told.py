@@ -139,16 +139,16 @@ def of_link(
     way: tuple[str, float, float, str],
     p: float,
     instead: Sequence[str],
+    remedy: str,
 ) -> dict[str, Any]:
     """A link that moved between two recordings that were fitted as one rig's, in the same form.
 
     Args:
-        first, later: what the recordings are called.
-        name: of the link.
+        first, later, name: what the recordings, and the link, are called.
         way: its parameter that shows it best, or that all changed alike; by how much that changed,
             with its sigma and unit.
         p: of so large a change by chance.
-        instead: links of which one may have moved in its place.
+        instead, remedy: links of which one may have moved in its place; what to do, a clause.
     """
     parameter, change, sigma, unit = way
     by = f"{parameter} by {'-' if change < 0 else ''}{size_told(abs(change), sigma, unit)}"
@@ -156,7 +156,7 @@ def of_link(
     what = "moved" if parameter in DOF else "changed"
     said = (
         f"between {first} and {later} {name} {what}, {by}{other}, and one fit takes it for the "
-        "same; fit each alone, the later with the run of the first as its --prior"
+        f"same; {remedy}"
     )
     return {
         **otherwise("frame", name, later, whole(said)),

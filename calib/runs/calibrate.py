@@ -268,9 +268,7 @@ def _fit(
     summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": odd(estimate)}
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
-        summary |= since(links, before.summary)
-        summary["prior_found_wrong"] = [*before.prior_found_wrong, *before.found_wrong]
-        summary["prior_diagnosed"] = (before.folder / DIAGNOSIS).is_file()
+        summary |= since(links, before.summary) | before.as_prior
     judged = estimate.loosened(moved_since_cad(summary))
     by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}

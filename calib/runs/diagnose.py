@@ -12,7 +12,6 @@ import numpy as np
 
 from calib import outputs
 from calib.blunders import told
-from calib.blunders.mixed import mixed_targets
 from calib.blunders.reach import FurthestMoved, hardly_checked, reaches
 from calib.diagnosis.chance import Spread
 from calib.diagnosis.rejects import Rejects, rejects
@@ -31,7 +30,7 @@ from calib.linear.parallel import one_blas_thread
 from calib.outputs.journal import going_on
 from calib.problem.model import default_effects
 from calib.problem.spread import names_of
-from calib.recalibration.between import moved_between
+from calib.recalibration.between import contradictions
 from calib.residuals.groups import MESH, Group
 from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
@@ -90,9 +89,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
-    between = () if run.converged else tuple(mixed_targets(stand.sources))
-    between = between or tuple(moved_between(stand, found.looks[-1].stand, progress))
-    if between:
+    if between := contradictions(stand, found, run.converged, progress):
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
         found, suspect = replace(_of_one_rig(found), **kept), []
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)

@@ -1,5 +1,6 @@
 """What several recordings of a rig contradict each other by, where no fit takes them together."""
 
+import re
 import shutil
 
 import numpy as np
@@ -28,10 +29,11 @@ def scanned_anew(recording, by=ANEW):
             targets.columns[name] = [repr(x) for x in column.tolist()]
 
 
-def mirrored(recording):
-    """The tracker's y the other way round, for bodies as for targets."""
+def mirrored(recording, targets=True):
+    """The tracker's y the other way round, for bodies, and for targets where they are too."""
     scene = Scene(recording, np.random.default_rng())
-    for sheet, ends in (("stops.csv", (".y", ".qx", ".qz")), ("targets.csv", ("er_y",))):
+    sheets = {"stops.csv": (".y", ".qx", ".qz"), "targets.csv": ("er_y",)}
+    for sheet, ends in list(sheets.items())[: 1 + targets]:
         with scene.sheet(sheet) as table:
             for name in (n for n in table.columns if n.endswith(ends)):
                 column = table.columns[name]
@@ -79,12 +81,22 @@ def test_in_one_fit_it_is_what_is_wrong(home, tmp_path):
 
 @pytest.mark.long
 def test_a_recording_that_fits_nothing_by_itself_is_named(home, tmp_path):
-    mirrored(home / "after")
+    mirrored(home / "after", targets=False)
     run = fit([home / "before", home / "after"], tmp_path / "run", hold_out="none")
     assert not run.converged
     (bad,) = diagnose(run).blunders
     assert (bad["kind"], bad["recording"]) == ("recording", "after")
     assert bad["sentence"].startswith("A fit to after alone comes to no optimum, and one to before")
+
+
+@pytest.mark.long
+def test_a_tracker_of_the_other_hand_is_told_by_its_targets(home, tmp_path):
+    mirrored(home / "after")
+    run = fit([home / "before", home / "after"], tmp_path / "run", hold_out="none")
+    assert not run.converged
+    (bad,) = diagnose(run).blunders
+    assert (bad["kind"], bad["name"], bad["recording"]) == ("target", "handedness", "after")
+    assert "left-handed" in bad["sentence"]
 
 
 def test_spheres_under_each_others_names_are_what_is_wrong_and_nothing_that_they_drag_along(
@@ -103,3 +115,24 @@ def test_spheres_under_each_others_names_are_what_is_wrong_and_nothing_that_they
     assert (found.verdict, blunder["kind"], blunder["without"]) == ("bad_data", "target", None)
     assert f"the scanner's {second} is the tracker's {first}" in blunder["sentence"]
     assert found.sentences[1] == blunder["sentence"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("by", [ANEW, np.array([0.0, 0.0, 0.003, 0.002, 0.0, 0.0])])
+def test_what_rigs_of_other_names_share_may_have_moved_as_well(home, tmp_path, by):
+    """Far off no fit of both has an optimum; by millimetres it has, and stops seem to scatter."""
+    other = shutil.copytree(home / "after", tmp_path / "other")
+    scanned_anew(other, by)
+    rig = (other / "rig.yaml").read_text()
+    (other / "rig.yaml").write_text(re.sub("^name: .*", "name: other", rig, flags=re.M))
+    run = fit([home / "before", other], tmp_path / "run", hold_out="none")
+    found = diagnose(run)
+    assert [each["name"] for each in found.blunders] == ["faro"] and found.verdict == "bad_data"
+    assert "another name in one rig.yaml" in found.blunders[0]["sentence"]
+    (other / "rig.yaml").write_text(
+        (other / "rig.yaml").read_text().replace("frame: faro", "frame: b")
+    )
+    apart = fit([home / "before", other], tmp_path / "apart", hold_out="none")
+    assert apart.converged and not [
+        b for b in diagnose(apart).blunders if b["name"] in ("faro", "b")
+    ]
