@@ -126,8 +126,8 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
         if v.of_members and v.dim > 1:
             of_all = np.ones((1, v.dim))
             mean = _test(_Pull(of_all @ block[0], *(of_all @ m @ of_all.T for m in block[1:])))
-            single = [p for p in map(_test, block.each) if p is not None]
-            least = min(single) * len(single) if single else None
+            single, told = block.each
+            least = told.sum() * float(chdtrc(1, single.max())) if told.any() else None
             several = [p for p in (found[v.name], mean, least) if p is not None]
             found[v.name] = min(1.0, len(TESTS_OF_MEMBERS) * min(several)) if several else None
     return found
@@ -141,8 +141,8 @@ def gained(prior: JointPrior, data: NewerData) -> dict[str, float]:
     found = {}
     for v, block in _pulls(prior, data):
         statistic, dof = block.statistic
-        one = max(each.statistic[0] - 2.0 * each.statistic[1] for each in block.each)
-        found[v.name] = max(statistic - 2.0 * dof, one - 2.0 * np.log(v.dim))
+        one = block.each[0].max() - 2.0 - 2.0 * np.log(v.dim)
+        found[v.name] = max(statistic - 2.0 * dof, one)
     return found
 
 
@@ -150,7 +150,7 @@ def shows_best(prior: JointPrior, data: NewerData, name: str) -> int:
     """Which parameter of a link explains most, had it alone moved; arguments as of `tests`. All of
     a link let go, what moved shows in others too, as the data tell them apart."""
     (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
-    return int(np.argmax([each.statistic[0] for each in block.each]))
+    return int(np.argmax(block.each[0]))
 
 
 def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.ndarray]:
@@ -171,8 +171,7 @@ def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.
         of_each = answer[k, k]
         if v.of_members and v.dim > 1:
             share = limit / len(TESTS_OF_MEMBERS)
-            own = zip(block.each, np.diag(of_each), strict=True)
-            alone = [each.told_from(np.array([[by]]), share / v.dim)[0] for each, by in own]
+            alone = block.told_from_alone(np.diag(of_each), share / v.dim)
             least = np.minimum(block.told_from(of_each, share), alone)
         else:
             least = block.told_from(of_each, limit)
@@ -198,28 +197,36 @@ class _Pull(NamedTuple):
     weight: np.ndarray
 
     @property
-    def each(self) -> list[_Pull]:
-        """Of its parameters one by one."""
-        of_one = (np.diag(self.spread), np.diag(self.weight))
-        return [
-            _Pull(np.array([p]), *np.array(m)[:, None, None])
-            for p, *m in zip(self.pull, *of_one, strict=True)
-        ]
-
-    @property
     def statistic(self) -> tuple[float, int]:
         """That of the test, and its degrees of freedom."""
         unit = self._units()
         return float(np.square(unit @ self.pull).sum()), len(unit)
 
+    @property
+    def each(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) those of tests of each parameter by itself, of one degree of freedom, and (n,)
+        whether anything but the prior holds it; 0 where nothing does."""
+        spread, told = np.diag(self.spread), self._told_alone
+        return np.divide(np.square(self.pull), spread, out=np.zeros(len(told)), where=told), told
+
     def told_from(self, answer: np.ndarray, limit: float) -> np.ndarray:
         """See `told_from`; `answer` (n, n) is by how much a move of each parameter pulls more."""
         unit = self._units()
-        if not len(unit):
-            return np.full(len(self.pull), np.inf)
-        enough = chndtrinc(chdtri(len(unit), limit), len(unit), 1.0 - POWER)
-        with np.errstate(divide="ignore"):
-            return np.sqrt(enough / np.square(unit @ answer).sum(axis=0))
+        return _enough(np.square(unit @ answer).sum(axis=0), len(unit), limit)
+
+    def told_from_alone(self, answer: np.ndarray, limit: float) -> np.ndarray:
+        """The same of tests of each parameter by itself; `answer` (n,)."""
+        seen = np.divide(
+            np.square(answer),
+            np.diag(self.spread),
+            out=np.zeros(len(answer)),
+            where=self._told_alone,
+        )
+        return _enough(seen, 1, limit)
+
+    @property
+    def _told_alone(self) -> np.ndarray:
+        return np.diag(self.spread) > (1.0 - LEFT_VARIANCE) * np.diag(self.weight)
 
     def _units(self) -> np.ndarray:
         """(m, n) that makes it unit noise, along the axes that anything but the prior holds."""
@@ -227,6 +234,15 @@ class _Pull(NamedTuple):
         told, axes = np.linalg.eigh(root @ self.spread @ root.T)
         use = told > 1.0 - LEFT_VARIANCE
         return (axes.T @ root)[use] / np.sqrt(told[use, None])
+
+
+def _enough(of_unit: np.ndarray, dof: int, limit: float) -> np.ndarray:
+    """How large (n,) a move has to be, where one of a unit makes the statistic of a test of so many
+    degrees of freedom non-central by `of_unit` (n,)."""
+    if not dof:
+        return np.full(len(of_unit), np.inf)
+    with np.errstate(divide="ignore"):
+        return np.sqrt(chndtrinc(chdtri(dof, limit), dof, 1.0 - POWER) / of_unit)
 
 
 def _pulls(prior: JointPrior, data: NewerData) -> Iterator[tuple[Unknown, _Pull]]:
