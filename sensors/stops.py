@@ -40,12 +40,12 @@ class Targets:
     lower_m: Array
     """(M, 3) lower marker of the rod."""
 
-    @property
-    def digests(self) -> dict[str, str]:
-        """Name -> a digest (hex) of all that was measured of it."""
+    def digests(self, of: str) -> dict[str, str]:
+        """Name -> a digest (hex) of all that was measured of it, and of what that is a measurement
+        of."""
         rows = np.hstack([self.faro_m, self.upper_m, self.lower_m])
         return {
-            name: hashlib.sha256(row.tobytes()).hexdigest()
+            name: hashlib.sha256(of.encode() + row.tobytes()).hexdigest()
             for name, row in zip(self.names, rows, strict=True)
         }
 

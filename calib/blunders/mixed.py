@@ -14,12 +14,13 @@ from calib.rig.scale import mixed_up
 def mixed_targets(sources: Sequence[Source]) -> Iterator[dict[str, Any]]:
     """Targets that scanner and tracker number otherwise, or see as in a mirror, as blunders of
     `diagnosis.json`; of several recordings that share them, once."""
-    said: set[str] = set()
+    said: set[tuple[object, ...]] = set()
     for label, source in zip(labels(sources), sources, strict=True):
         targets, spec = source.recording.targets, source.rig.target
         for each in mixed_up(targets, spec) if targets and spec else ():
             where = str(source.recording.folder / "targets.csv")
-            if each.sentence not in said:
-                said.add(each.sentence)
+            measured = (each.sentence, *source.measured_targets.values())
+            if measured not in said:
+                said.add(measured)
                 found = otherwise("target", each.name, where, whole(f"{where}: {each.sentence}"))
                 yield found | {"recording": label or None}

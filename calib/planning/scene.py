@@ -242,7 +242,7 @@ class PlanningScene:
         of paper; arguments as of `of_all`."""
         if self.prior is None:
             return of_all(problem, values, associations, self.unbounded)
-        problem = problem.resting_on(self.prior.rests_on)
+        problem = problem.resting_on(self.prior.rests_on, self.prior.variables)
         return of_all(problem, values, associations, self.unbounded).believing(self.prior)
 
     def _with(

@@ -167,8 +167,8 @@ def _tracker_bases(part: SourceStops) -> _Added:
 
 
 def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
-    """Add gravity, and a block with its marker's place for every target; one that a recording
-    before it has too, measured once for both, counts there."""
+    """Add gravity, and a block with its marker's place for every target. A target that an earlier
+    recording has too, with the same numbers, is added only once."""
     targets, spec = part.source.recording.targets, part.source.rig.target
     if targets is None or spec is None or places.reference is None:
         return
@@ -195,7 +195,7 @@ def add_targets(problem: Problem, part: SourceStops, places: Places) -> None:
     counted = {d for s in problem.sources[: part.number] for d in s.measured_targets.values()}
     digests = part.source.measured_targets
     for m, name in enumerate(targets.names):
-        if digests[name] in counted:
+        if digests.get(name) in counted:
             continue
         marker = vector_unknown(
             f"{part.prefix}target:{name}",

@@ -317,10 +317,22 @@ class Source:
 
     @cached_property
     def measured_targets(self) -> Mapping[str, str]:
-        """Targets of its targets.csv that tie the reference's frame to the tracker's -> a digest of
-        what was measured of each; those that are left out as well."""
-        targets, ties = self.whole.recording.targets, self.rig.target and self.rig.tracker
-        return targets.digests if targets and ties else {}
+        """Targets of its targets.csv -> a digest of what was measured of each and of the names of
+        the two frames that it ties to each other; those that are left out as well."""
+        targets, rig = self.whole.recording.targets, self.rig
+        if targets is None or rig.target is None or rig.tracker is None:
+            return {}
+        return targets.digests(f"{rig.world} {rig.reference_frame}")
+
+    @property
+    def counted_targets(self) -> frozenset[str]:
+        """Digests of those of them whose sphere is not left out."""
+        targets = self.recording.targets
+        if targets is None:
+            return frozenset()
+        seen = zip(targets.names, np.isfinite(targets.faro_m).all(axis=1), strict=True)
+        there = (self.measured_targets.get(name) for name, counts in seen if counts)
+        return frozenset(digest for digest in there if digest is not None)
 
     @cached_property
     def unread(self) -> frozenset[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,7 +12,6 @@ from scipy.linalg import cholesky, solve_triangular
 from calib.forward import Derivatives, Values
 from calib.problem.unknowns import Unknown
 from chains import se3
-from chains.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -72,19 +71,6 @@ class JointPrior:
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return replace(self, covariance=covariance, freed=self.freed | freed.keys())
-
-    def of(self, names: Collection[str]) -> JointPrior:
-        """What it says of those of its variables that have one of these names.
-
-        Raises:
-            InputError: there is none.
-        """
-        held = [v for v in self.held if v.name in names]
-        if not held:
-            raise InputError("the earlier estimate has none of these unknowns")
-        ends = dict(zip(self.variables, np.cumsum([v.dim for v in self.held]), strict=True))
-        at = np.concatenate([np.arange(ends[v.name] - v.dim, ends[v.name]) for v in held])
-        return replace(self, held=held, covariance=self.covariance[np.ix_(at, at)])
 
     @cached_property
     def _root(self) -> np.ndarray:

@@ -157,12 +157,14 @@ class Problem:
         ]
         return replace(self, scans=kept, aside=gone, blocks=blocks)
 
-    def resting_on(self, known: Collection[str]) -> Problem:
+    def resting_on(self, known: Collection[str], held: Collection[str]) -> Problem:
         """The problem for a fit from an earlier one: of targets that the earlier fit rests on, the
-        spheres weigh nothing. What these say of the scanner's frame is known from there.
+        spheres weigh nothing. What these say is known from there. They count where the model has an
+        unknown of targets that the earlier fit did not have, as nothing else would tell of it.
 
         Args:
             known: digests, as of `Source.measured_targets`.
+            held: unknowns that the earlier fit tells of.
         """
         gone = {
             (label, target)
@@ -170,12 +172,12 @@ class Problem:
             for target, digest in source.measured_targets.items()
             if digest in known
         }
-        blocks = [
-            block.without_sphere()
-            if isinstance(block, HangingTarget) and block.groups[0].place in gone
-            else block
-            for block in self.blocks
-        ]
+
+        def rests(block: Block) -> bool:
+            there = isinstance(block, HangingTarget) and block.groups[0].place in gone
+            return there and {block.reference, *block.of_effects}.issubset(held)
+
+        blocks = [block.without_sphere() if rests(block) else block for block in self.blocks]
         return replace(self, blocks=blocks) if gone else self
 
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:

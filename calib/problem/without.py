@@ -52,6 +52,8 @@ def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
         found = [(i, g) for i, (s, label) in every for g in _matching(s, label, token)]
         shared = _sharing_a_target([(out[i], g) for i, g in found], out, called)
         found = shared or found
+        if len(shared) > 1 and all(group in out[i].without for i, group in shared):
+            continue  # by another of its names
         if any(group in out[i].without for i, group in found):
             raise InputError(f"--without {token}: that is left out already; name it once")
         shared = shared or (found and found[0][1].where in (CAD, MESH))
@@ -75,6 +77,8 @@ def _sharing_a_target(
 ) -> list[tuple[int, Group]]:
     """Where all that was found is one target, that of every recording that has what was measured of
     it, by their numbers; else nothing."""
+    if any(group.kind != "target" for _, group in found):
+        return []
     digests = {source.measured_targets.get(group.where) for source, group in found}
     if len(digests) != 1 or None in digests:
         return []

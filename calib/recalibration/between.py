@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -24,9 +24,8 @@ from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
 
 FIT_EACH = "fit each alone, the later with the run of the first as its --prior"
-OTHER_FRAME = (
-    f"{FIT_EACH}, or give that frame another name in one rig.yaml, if the scanner stood elsewhere"
-)
+FIT_APART = "fit each alone"
+OTHER_FRAME = "give that frame another name in one rig.yaml, if the scanner stood elsewhere"
 
 
 class _Alone(NamedTuple):
@@ -61,8 +60,9 @@ def moved_between(
 ) -> Iterator[dict[str, Any]]:
     """The links that moved between the first recording of a rig and a later one, as blunders of
     `diagnosis.json`: as a fit of the later one, with that of the first as its prior, finds them.
-    Where anything is wrong, so of what recordings of different rigs share, as the scanner's frame;
-    and where the fit to all has no optimum, recordings that have none by themselves.
+    Where anything is wrong, it is also asked what moved of the parts that rigs of other names
+    share, as the scanner's frame. Where the fit to all has no optimum, recordings that have none
+    by themselves are named as well.
 
     Args:
         stand: a model, fitted to all recordings.
@@ -78,56 +78,62 @@ def moved_between(
     for label, source in named.items():
         of_rigs.setdefault(source.rig.name, []).append(label)
     alarm = ALARM / max(1, len(named) - (len(of_rigs) if calm else 1))
-    of_all: tuple[str, _Alone] | None = None  # the first recording, of whatever rig
-    for rig, mine in of_rigs.items():
+    firsts: dict[str, _Alone] = {}  # of rigs before, to compare with
+    for mine in of_rigs.values():
+        before = next((label for label in firsts if _shared(stand, label, mine[0])), None)
         if len(mine) == 1 and (calm or len(of_rigs) == 1):
             continue
-        ask = mine[:1] if stand.estimate.converged else mine
-        alone = {label: _alone(model, named[label], progress) for label in ask}
-        first = next((label for label, each in alone.items() if each.known), None)
+        alone = {}
+        if len(mine) > 1 or before is None or not stand.estimate.converged:
+            ask = mine[:1] if stand.estimate.converged else mine
+            alone = {label: _alone(model, named[label], progress) for label in ask}
+        bad = [label for label, each in alone.items() if each.can_fit and not each.known]
+        first = next((label for label in mine if label not in alone or alone[label].known), None)
+        yield from (told.of_recording(label, first or before) for label in bad if first or before)
         if first is None:
             continue
-        bad = [label for label, each in alone.items() if each.can_fit and not each.known]
-        yield from (told.of_recording(label, first) for label in bad)
         for label in (each for each in mine if each not in (first, *bad)):
             for link in _since(alone[first], model, named[label], alarm, progress):
-                yield _told(named, first, label, link, f"{rig}/" if len(of_rigs) > 1 else "")
-        if of_all is not None and not calm:
-            common = _shared(stand, of_all[0], first)
-            for link in _since(of_all[1], model, named[first], alarm, progress, common):
-                yield _told(named, of_all[0], first, link)
-        of_all = of_all or (first, alone[first])
+                yield _told(stand, first, label, link, FIT_EACH)
+        if before is not None:
+            common = _shared(stand, before, first)
+            for link in _since(firsts[before], model, named[first], alarm, progress, common):
+                yield _told(stand, before, first, link, FIT_APART)
+        if first in alone and not calm:
+            firsts[first] = alone[first]
 
 
 def _shared(stand: Stand, *of: str) -> set[str]:
     """Unknowns of the hardware that recordings, called so, have in common in a fit to all."""
-    problem = stand.problem
-    every = zip(labels(problem.sources), problem.sources, problem.terms, strict=True)
-    each = [
-        {source.rig.reference_frame, *(term.variable for term in terms if not term.rig)}
-        for label, source, terms in every
-        if label in of
-    ]
+    each = [{*_names_in_all(stand, label).values()} for label in of]
     return set.intersection(*each)
 
 
-def _told(
-    named: Mapping[str, Source], first: str, later: str, link: Link, rig: str = ""
-) -> dict[str, Any]:
+def _names_in_all(stand: Stand, label: str) -> dict[str, str]:
+    """What the unknowns of a recording's hardware are called when it is fitted alone -> in a fit to
+    all."""
+    problem = stand.problem
+    i = labels(problem.sources).index(label)
+    frame = problem.sources[i].rig.reference_frame
+    own = {term.effect.name: term.variable for term in problem.terms[i]}
+    return own | ({frame: frame} if frame in problem.variables else {})
+
+
+def _told(stand: Stand, first: str, later: str, link: Link, remedy: str) -> dict[str, Any]:
     """As a blunder, by the parameter, or the mean of them, that shows it best."""
-    best = link.parameters.index(link.shown_by)
-    way = link.parameters[best], link.change[best], link.sigma[best], link.units[best]
+    best, name = link.parameters.index(link.shown_by), _names_in_all(stand, later)
+    way = link.shown_by, *link.alone, link.units[best]
     if link.of_mean:
         way = "all alike", *link.of_mean, link.units[0]
-    frame = named[later].rig.reference_frame
+    of_scanner = link.name in {source.rig.reference_frame for source in stand.sources}
     return told.of_link(
         first,
         later,
-        frame if link.name == frame else f"{rig}{link.name}",
+        name.get(link.name, link.name),
         way,
         p=link.p_value,
-        instead=[f"{rig}{name}" for name in link.instead],
-        remedy=OTHER_FRAME if link.name == frame else FIT_EACH,
+        instead=[name.get(each, each) for each in link.instead],
+        remedy=f"{remedy}, or {OTHER_FRAME}" if of_scanner else remedy,
     )
 
 
@@ -142,8 +148,8 @@ def _alone(model: Model, source: Source, progress: Progress) -> _Alone:
         return _Alone(None, can_fit=True)
     seen = errors_at(estimate.problem, estimate.values)
     known = widened(intervals(shapes_freed(estimate, model), progress), estimate, seen)
-    targets = frozenset(source.measured_targets.values())
-    return _Alone(solution_of(problem, estimate, known), can_fit=True, targets=targets)
+    solution = solution_of(problem, estimate, known)
+    return _Alone(solution, can_fit=True, targets=source.counted_targets)
 
 
 def _since(
@@ -158,9 +164,7 @@ def _since(
     fitted; of all that both have, or of some unknowns alone; other arguments as of `let_go`."""
     try:
         problem = build([source], model)
-        prior = earlier(problem, first.known, first.targets)
-        if common is not None:
-            prior = prior.of(common)
+        prior = earlier(problem, first.known, first.targets, common)
         estimate, _, _, links = solve_from(problem, model, prior, progress, alarm)
     except InputError:
         return []

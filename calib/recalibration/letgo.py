@@ -16,9 +16,9 @@ from calib.recalibration.newer import (
     NewerData,
     RefittedPrior,
     blocks_of,
-    gained,
+    fall_of_aic,
     left_by_moves,
-    shows_best,
+    moved_alone,
     tests,
     told_from,
 )
@@ -32,7 +32,8 @@ STRONG_ODDS = 20.0
 SECOND_LOOK = 0.1  # of that chance, for what shows only once it is let go (weighted Bonferroni)
 OFF = 3.0  # sigmas, a choice: what is further off than that is wrong, as people read sigmas
 UNLIKE = 0.01  # chance that rings that changed alike are not told to have done so
-# Of one recalibration, until it settles: one where nothing moved, two where data stay as they are.
+# Of each look at one recalibration, until it settles: one where nothing moved, two where data stay
+# as they are.
 MOST_FITS = 4
 
 
@@ -56,8 +57,8 @@ class _Moves(NamedTuple):
 
 
 class _Settled(NamedTuple):
-    """What newer data say in the fit with which `let_go` ends, what moved, what was let go there,
-    and what in any fit."""
+    """Where fits end: what newer data say in the last but one, what moved, what the last lets go,
+    and what any of them did."""
 
     data: NewerData
     moves: _Moves
@@ -93,12 +94,12 @@ def let_go(
         free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in first.not_trusted}
         first = fit(prior.loosened(free))
     settled = _settled(prior, fit, free, first, limit)
-    if not (free or settled.moves.free):
+    if first.converged and not (free or settled.moves.free):
         by_rows = NewerData.of(prior, first).by_single_rows
         hidden = _Moves.of(prior, by_rows, SECOND_LOOK * limit).free
         if hidden.keys() - settled.tried:
-            limit *= SECOND_LOOK
-            settled = _settled(prior, fit, hidden, fit(prior.loosened(hidden)), limit)
+            now = fit(prior.loosened(hidden))
+            settled = _settled(prior, fit, hidden, now, SECOND_LOOK * limit)
     return _links(prior, settled, limit)
 
 
@@ -109,15 +110,21 @@ def _settled(
     now: RefittedPrior,
     limit: float,
 ) -> _Settled:
-    """Where fits end, of which the first, `now`, let some links go; arguments as of `let_go`."""
+    """Where fits end.
 
-    def held() -> JointPrior:
+    Args:
+        prior, fit: as of `let_go`.
+        free, now: what the first of them let go, and that fit.
+        limit: p-value of a link from which on it is beyond chance.
+    """
+
+    def without(free: Mapping[str, float]) -> JointPrior:
         return prior.loosened(free) if free else prior
 
     fits: list[dict[str, float]] = []
     last = False
     while True:
-        found = _Moves.of(prior, NewerData.of(held(), now), limit).free
+        found = _Moves.of(prior, NewerData.of(without(free), now), limit).free
         if last or _alike(found, free):
             break
         fits.append(free)
@@ -126,14 +133,14 @@ def _settled(
         if last and _alike(both, free):
             break
         free = both if last else found
-        now = fit(held())
+        now = fit(without(free))
         last = last or not now.converged
     tried = frozenset(name for each in (*fits, free) for name in each)
-    data = NewerData.of(held(), now.at_least)
+    data = NewerData.of(without(free), now.at_least)
     moves = _Moves.of(prior, data, limit)
     if moves.free.keys() != free.keys():
         free = moves.free
-        fit(held())
+        fit(without(free))
     return _Settled(data, moves, free, tried)
 
 
@@ -159,7 +166,7 @@ def _from_afar(
 
 
 def _links(prior: JointPrior, settled: _Settled, limit: float) -> list[Link]:
-    """What became of each link, given where fits end; arguments as of `_settled`."""
+    """What became of each link, where fits end so; `limit` as of `_settled`."""
     data, moves, free, _ = settled
     held = prior.loosened(moves.moved)
     p_values, now, links = tests(held, data), data.fitted(held), []
@@ -168,13 +175,14 @@ def _links(prior: JointPrior, settled: _Settled, limit: float) -> list[Link]:
     for name in moves.moved:
         others = prior.loosened(_without(moves.moved, name))
         p_values[name] = tests(others, data)[name]
-        shown_by[name] = shows_best(others, data, name)
+        shown_by[name] = moved_alone(others, data, name)
     for v in prior.held:
         link = _link(v, held, now, p_values[v.name], moves.moved.get(v.name, 0.0))
         instead = tuple(moves.instead.get(v.name, {}))
         link = replace(link, freed=free.get(v.name, 0.0), instead=instead)
         if v.name in shown_by:
-            link = replace(link, shown_by=v.dofs[shown_by[v.name]])
+            best, *alone = shown_by[v.name]
+            link = replace(link, shown_by=v.dofs[best], alone=tuple(alone))
         if not link.moved and link.p_value is not None:
             off = v.sigma * left[blocks_of(prior.held)[v.name]]
             hidden = (least[v.name] > v.sigma) & (off > OFF)
@@ -232,9 +240,9 @@ def _instead(
         held = prior.loosened(others)
         beyond = _beyond(held, data, STRONG_ODDS * limit)
         ways = {n: odds.freest(others, n) for n in beyond if n not in moved}
-        gain = gained(held, data)
-        least = gain[name] - 2.0 * np.log(STRONG_ODDS)
-        alike = {n for n, way in ways.items() if gain[n] > least and way[n] <= moved[name]}
+        fall = fall_of_aic(held, data)
+        least = fall[name] - 2.0 * np.log(STRONG_ODDS)
+        alike = {n for n, way in ways.items() if fall[n] > least and way[n] <= moved[name]}
         found[name] = {n: w[n] for n, w in ways.items() if n in alike or odds.gain(w) > enough}
     return found
 

@@ -28,11 +28,14 @@ class Link:
         instead: links of which one may have moved in its place: the data cannot tell.
         of_mean: of what is one quantity of several rings or labels, and has changed alike, the
             change of their mean and the sigma of that; else empty.
-        shown_by: of one that moved, the parameter that explains most had it alone moved.
+        shown_by: of one that moved, the parameter that explains most had it alone moved; else
+            empty.
+        alone: by how much that did then, and the sigma of that; else empty.
         told_from: (n,) of one that has not moved, how far each parameter would have to move by
             itself to be told; else empty. See `calib.recalibration.newer.told_from`.
         unchecked: parameters of one that has not moved, of which a move as large as CAD's sigma
-            would not be told, and would leave the estimate more than 3 of its sigmas off.
+            would not be told, and would leave that parameter more than 3 of its sigmas off; none of
+            a frame of which CAD says nothing, as the scanner's.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Link:
     instead: tuple[str, ...] = ()
     of_mean: tuple[float, ...] = ()
     shown_by: str = ""
+    alone: tuple[float, ...] = ()
     told_from: np.ndarray | tuple[float, ...] = ()
     unchecked: tuple[str, ...] = ()
 
@@ -63,6 +67,7 @@ class Link:
             "instead": self.instead,
             "of_mean": self.of_mean,
             "shown_by": self.shown_by,
+            "alone": self.alone,
             "unchecked": self.unchecked,
             "told_from": [float(x) if np.isfinite(x) else None for x in self.told_from],
         }

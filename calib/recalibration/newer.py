@@ -13,10 +13,11 @@ from calib.blunders.chance import POWER
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 
-# Of the earlier variance left along a direction: more, and the new data say nothing there. Chosen
-# so that alone they would know it 30 times less well. Three times was too little: of one stop, a
-# LiDAR that had moved by millimetres was told as a move of the scanner's frame, or not at all.
+# Of the earlier variance left along a direction, up to which the new data are asked about it: where
+# they alone know it at most 30 times worse than the earlier run. With 3 times, a LiDAR that had
+# moved by millimetres, seen at one stop, was told as a move of the scanner's frame, or not at all.
 LEFT_VARIANCE = 0.999
+NEVER = 1e-9  # of the earlier information on a parameter, as what rounding leaves: it shows nothing
 TESTS_OF_MEMBERS = ("all", "their mean", "each")  # of unknowns with a value for each ring, say
 
 
@@ -124,8 +125,7 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
     for v, block in _pulls(prior, data):
         found[v.name] = _test(block)
         if v.of_members and v.dim > 1:
-            of_all = np.ones((1, v.dim))
-            mean = _test(_Pull(of_all @ block[0], *(of_all @ m @ of_all.T for m in block[1:])))
+            mean = _test(block.mean)
             single, told = block.each
             least = told.sum() * float(chdtrc(1, single.max())) if told.any() else None
             several = [p for p in (found[v.name], mean, least) if p is not None]
@@ -133,29 +133,34 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
     return found
 
 
-def gained(prior: JointPrior, data: NewerData) -> dict[str, float]:
+def fall_of_aic(prior: JointPrior, data: NewerData) -> dict[str, float]:
     """Per link, by how much Akaike's criterion falls where it is let go, or one of its parameters
-    alone: the statistic, as of `tests`, less twice the number of parameters that the data tell and,
-    for that one, as it may be any of n, 2 log n. Half the difference of two links is the logarithm
-    of their odds (Akaike 1974; Burnham and Anderson 2002, 2.9)."""
+    alone, or the mean of its members: the statistic, as of `tests`, less twice the number of
+    parameters that the data tell and, for one of n, 2 log n. Half the difference of two links is
+    the logarithm of their odds (Akaike 1974; Burnham and Anderson 2002, 2.9)."""
     found = {}
     for v, block in _pulls(prior, data):
-        statistic, dof = block.statistic
+        ways = [block.statistic, *([block.mean.statistic] if v.of_members else [])]
         one = block.each[0].max() - 2.0 - 2.0 * np.log(v.dim)
-        found[v.name] = max(statistic - 2.0 * dof, one)
+        found[v.name] = max(one, *(statistic - 2.0 * dof for statistic, dof in ways))
     return found
 
 
-def shows_best(prior: JointPrior, data: NewerData, name: str) -> int:
-    """Which parameter of a link explains most, had it alone moved; arguments as of `tests`. All of
-    a link let go, what moved shows in others too, as the data tell them apart."""
+def moved_alone(prior: JointPrior, data: NewerData, name: str) -> tuple[int, float, float]:
+    """Which parameter of a link explains most, had it alone moved; by how much then, and the sigma
+    of that; arguments as of `tests`. All of a link let go, what moved shows in others too, as the
+    data tell them apart."""
     (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
-    return int(np.argmax(block.each[0]))
+    best, k = int(np.argmax(block.each[0])), blocks_of(prior.held)[name]
+    answer = Force.of(prior, data).answer[k, k][best, best]
+    unit = np.sqrt(np.diag(prior.covariance)[k][best]) / answer
+    return best, float(unit * block.pull[best]), float(unit * np.sqrt(block.spread[best, best]))
 
 
 def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.ndarray]:
     """Per link, how far (n,) each of its parameters has to move by itself, all else at rest, for
-    `tests` to tell it with a chance of `POWER`; infinite where the data never do.
+    `tests` to tell it with a chance of `POWER`, by that of the whole link or, of members, by its
+    own; infinite where the data never do.
 
     A move of size x along a parameter makes the statistic of a test non-central, by x^2 times what
     the pull's answer to a unit has of its own covariance (Baarda 1968: internal reliability).
@@ -171,21 +176,22 @@ def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.
         of_each = answer[k, k]
         if v.of_members and v.dim > 1:
             share = limit / len(TESTS_OF_MEMBERS)
-            alone = block.told_from_alone(np.diag(of_each), share / v.dim)
-            least = np.minimum(block.told_from(of_each, share), alone)
+            alone = block.seen_from_alone(np.diag(of_each), share)
+            least = np.minimum(block.seen_from(of_each, share), alone)
         else:
-            least = block.told_from(of_each, limit)
+            least = block.seen_from(of_each, limit)
         found[v.name] = unit[k] * least
     return found
 
 
 def left_by_moves(prior: JointPrior, data: NewerData) -> np.ndarray:
     """By how much (P,) each parameter is off, in its sigmas now, for a unit of a move of its own
-    that nobody tells: the earlier value holds it (external reliability: Baarda 1968)."""
+    that nobody tells: the earlier value holds it, or what goes along with it draws it the other way
+    (external reliability: Baarda 1968)."""
     now, scale = data.fitted(prior), np.sqrt(np.diag(prior.covariance))
     both = np.outer(scale, scale)
     held = (now.graph / both) @ np.linalg.inv(prior.covariance / both)
-    return np.diag(held) / np.sqrt(np.diag(now.covariance))
+    return np.abs(np.diag(held)) / np.sqrt(np.diag(now.covariance))
 
 
 class _Pull(NamedTuple):
@@ -209,20 +215,32 @@ class _Pull(NamedTuple):
         spread, told = np.diag(self.spread), self._told_alone
         return np.divide(np.square(self.pull), spread, out=np.zeros(len(told)), where=told), told
 
-    def told_from(self, answer: np.ndarray, limit: float) -> np.ndarray:
+    @property
+    def mean(self) -> _Pull:
+        """At the mean of all parameters."""
+        of_all = np.ones((1, len(self.pull)))
+        return _Pull(of_all @ self.pull, *(of_all @ m @ of_all.T for m in self[1:]))
+
+    def seen_from(self, answer: np.ndarray, limit: float) -> np.ndarray:
         """See `told_from`; `answer` (n, n) is by how much a move of each parameter pulls more."""
         unit = self._units()
-        return _enough(np.square(unit @ answer).sum(axis=0), len(unit), limit)
+        return self._enough(np.square(unit @ answer).sum(axis=0), len(unit), limit)
 
-    def told_from_alone(self, answer: np.ndarray, limit: float) -> np.ndarray:
-        """The same of tests of each parameter by itself; `answer` (n,)."""
-        seen = np.divide(
-            np.square(answer),
-            np.diag(self.spread),
-            out=np.zeros(len(answer)),
-            where=self._told_alone,
-        )
-        return _enough(seen, 1, limit)
+    def seen_from_alone(self, answer: np.ndarray, limit: float) -> np.ndarray:
+        """The same of tests of each parameter by itself, which share the limit; `answer` (n,)."""
+        told, spread = self._told_alone, np.diag(self.spread)
+        seen = np.divide(np.square(answer), spread, out=np.zeros(len(answer)), where=told)
+        return self._enough(seen, int(told.any()), limit / max(1, told.sum()))
+
+    def _enough(self, of_unit: np.ndarray, dof: int, limit: float) -> np.ndarray:
+        """How large (n,) a move has to be, where one of a unit makes the statistic of a test of so
+        many degrees of freedom non-central by `of_unit` (n,)."""
+        shows = of_unit > NEVER * np.diag(self.weight)
+        if not (dof and shows.any()):
+            return np.full(len(of_unit), np.inf)
+        enough = chndtrinc(chdtri(dof, limit), dof, 1.0 - POWER)
+        ratio = np.divide(enough, of_unit, out=np.full(len(of_unit), np.inf), where=shows)
+        return np.sqrt(ratio)
 
     @property
     def _told_alone(self) -> np.ndarray:
@@ -234,15 +252,6 @@ class _Pull(NamedTuple):
         told, axes = np.linalg.eigh(root @ self.spread @ root.T)
         use = told > 1.0 - LEFT_VARIANCE
         return (axes.T @ root)[use] / np.sqrt(told[use, None])
-
-
-def _enough(of_unit: np.ndarray, dof: int, limit: float) -> np.ndarray:
-    """How large (n,) a move has to be, where one of a unit makes the statistic of a test of so many
-    degrees of freedom non-central by `of_unit` (n,)."""
-    if not dof:
-        return np.full(len(of_unit), np.inf)
-    with np.errstate(divide="ignore"):
-        return np.sqrt(chndtrinc(chdtri(dof, limit), dof, 1.0 - POWER) / of_unit)
 
 
 def _pulls(prior: JointPrior, data: NewerData) -> Iterator[tuple[Unknown, _Pull]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -17,20 +17,26 @@ from chains import se3
 from chains.errors import InputError
 
 
-def earlier(problem: Problem, solution: Solution, rests_on: Iterable[str] = ()) -> JointPrior:
+def earlier(
+    problem: Problem,
+    solution: Solution,
+    rests_on: Iterable[str] = (),
+    among: Collection[str] | None = None,
+) -> JointPrior:
     """An earlier solution as a joint prior over those variables that the problem has too.
 
     Args:
         problem: of newer recordings.
         solution: the earlier one.
         rests_on: digests of the measurements that it rests on.
+        among: variables that are asked for; all where None.
 
     Raises:
         InputError: the two have nothing in common.
     """
     position = {key: i for i, key in enumerate(solution.keys)}
     held, means, rows = [], {}, []
-    for name in problem.calibration:
+    for name in (n for n in problem.calibration if among is None or n in among):
         variable = problem.variables[name]
         index = [position.get(key) for key in variable.keys]
         mean = _earlier_value(problem, variable, solution)

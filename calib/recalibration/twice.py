@@ -69,7 +69,7 @@ def all_once(
                 f"{listed(same)} of {source.recording.folder} already, and data count once; fit "
                 f"without --prior or, for another model of these data, 'rigcal add {prior} EFFECT'"
             )
-    targets = (digest for source in sources for digest in source.measured_targets.values())
+    targets = (digest for source in sources for digest in source.counted_targets)
     return sorted({*known, *targets, *(digest for each in found for digest in each.values())})
 
 

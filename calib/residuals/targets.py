@@ -63,9 +63,13 @@ class HangingTarget:
     rows = 9
 
     @property
+    def of_effects(self) -> tuple[str, ...]:
+        """Variables of effects on it."""
+        return (*self.shift, *self.scanned, *self.tracked)
+
+    @property
     def variables(self) -> tuple[str, ...]:
-        of_effects = (*self.shift, *self.scanned, *self.tracked)
-        return (self.marker, self.gravity, self.reference, *of_effects)
+        return (self.marker, self.gravity, self.reference, *self.of_effects)
 
     def without_sphere(self) -> HangingTarget:
         """The target where its sphere says nothing."""

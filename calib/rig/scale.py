@@ -47,7 +47,8 @@ def mixed_up(targets: Targets, spec: TargetSpec) -> list[Suspect]:
         return []
     names = [name for name, kept in zip(targets.names, whole, strict=True) if kept]
     odd = odd_targets(Targets(names, *(part[whole] for part in parts)), spec)
-    return [s for s in odd if isinstance(s, Suspect) and s.name in (NUMBERED, HANDEDNESS)]
+    of_all = {NUMBERED, HANDEDNESS}.difference(names)
+    return [s for s in odd if isinstance(s, Suspect) and s.name in of_all]
 
 
 def odd_targets(targets: Targets, spec: TargetSpec) -> Iterator[str | Suspect]:

@@ -3,6 +3,7 @@ each for fit, diagnosis and report."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from calib.results.errors import judged_mm
 from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
 from calib.results.sigmas import TOLERATED
-from calib.runs.run import Run
+from calib.runs.run import DIAGNOSIS, Run
 
 # Times its sigmas, or what is expected: residuals that something large is behind. A choice: sigmas
 # of data sheets are wrong by a factor of two at times, and then widened.
@@ -87,11 +88,12 @@ def _another_rig(run: Run) -> list[str]:
 def _not_asked(run: Run) -> list[str]:
     """That something moved since a run which nobody asked what its model lacks: that may be it."""
     moved = any(link["moved"] for link in run.summary.get("links") or ())
-    if not moved or run.summary.get("prior_diagnosed", True):  # which older runs lack
+    there = run.prior is not None and run.prior.is_dir()
+    if not (moved and there) or (run.prior / DIAGNOSIS).is_file():
         return []
     return [
         "the earlier run was not diagnosed, and what its model lacks may seem to have moved; "
-        f"'rigcal diagnose {run.prior}' looks for that"
+        f"'{shlex.join(['rigcal', 'diagnose', str(run.prior)])}' looks for that"
     ]
 
 

@@ -268,7 +268,8 @@ def _fit(
     summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": odd(estimate)}
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
-        summary |= since(links, before.summary) | before.as_prior
+        summary |= since(links, before.summary)
+        summary["prior_found_wrong"] = [*before.prior_found_wrong, *before.found_wrong]
     judged = estimate.loosened(moved_since_cad(summary))
     by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}

@@ -164,15 +164,6 @@ class Run:
         return list(self.summary.get("prior_found_wrong", ()))
 
     @property
-    def as_prior(self) -> dict[str, Any]:
-        """Of a run that is fitted from it: what diagnoses of it, and of its own prior, found wrong;
-        and whether there was any."""
-        return {
-            "prior_found_wrong": [*self.prior_found_wrong, *self.found_wrong],
-            "prior_diagnosed": (self.folder / DIAGNOSIS).is_file(),
-        }
-
-    @property
     def found_wrong(self) -> list[str]:
         """What its diagnosis found that speaks against its numbers as they are, as a sentence; none
         where it found nothing of the kind, or there is none that can be read."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.results.outstanding import shown
+from calib.rig.suspect import listed
 from calib.runs.run import Run
 from calib.show.misfit import and_angle, over_beams
 from calib.show.verdict import UNASKED, judge
@@ -81,8 +82,9 @@ def moved_sentence(links: Sequence[Mapping[str, Any]], words: Words = MOVED_WORD
         out = words.none
     if silent:
         out += f"; {words.silent.format(', '.join(link['name'] for link in silent))}"
-    if hidden := [link["name"] for link in still if link.get("unchecked")]:
-        out += f"; {words.hidden.format(', '.join(hidden))}"
+    if hidden := [link for link in still if link.get("unchecked")]:
+        each = (f"{link['name']} ({listed(link['unchecked'])})" for link in hidden)
+        out += f"; {words.hidden.format(', '.join(each))}"
     return f"{out}."
 
 
@@ -129,6 +131,9 @@ def _changes(link: Mapping[str, Any], words: Words) -> Iterator[str]:
             continue
         cells = [f"{scale * change[i]:+.2f} ± {scale * sigma[i]:.2f} {told}" for i in mine]
         if not of_frame:
+            if best == names[mine[0]] and link.get("alone"):
+                by, sigma_by = (scale * each for each in link["alone"])
+                cells = [f"{by:+.2f} ± {sigma_by:.2f} {told}"]
             yield f"{words.changed} {cells[0]} ({names[mine[0]]})"
             continue
         verb, way = (words.shifted, "in") if unit == "m" else (words.turned, "about")

@@ -325,16 +325,19 @@ def print_links(
 
 
 def _seen_from(link: Mapping[str, Any]) -> str:
-    """From what size on a move of a link at rest is seen, in its units, and of which of its
-    parameters one that CAD has hardly is."""
+    """From what size on a move of a link at rest is seen, of its best and its worst parameter in
+    each unit; of which it never is, and of which one that CAD has hardly is."""
     texts, known = [], list(zip(link.get("told_from", ()), link["units"], strict=False))
     for scale, unit in map(shown, dict.fromkeys(unit for _, unit in known)):
-        each = sorted(scale * least for least, u in known if shown(u)[1] == unit and least)
-        ends = dict.fromkeys(f"{float(f'{x:.2g}'):g}" for x in (each[:1] + each[-1:]))
-        texts += [f"{' to '.join(ends)} {unit}".rstrip()] if each else []
-    hardly = listed(link.get("unchecked", ()))
-    seen = f"; seen from {', '.join(texts[::-1])}" if texts else ""
-    return seen + (f"; hardly checked: {hardly}" if hardly else "")
+        each = [scale * least for least, u in known if shown(u)[1] == unit and least]
+        if each:
+            best, worst = (f"{float(f'{x:.2g}'):g}" for x in (min(each), max(each)))
+            rest = "" if best == worst else f" (at worst {worst})"
+            texts.append(f"{best} {unit}".rstrip() + rest)
+    never = [n for n, (least, _) in zip(link["parameters"], known, strict=False) if not least]
+    said = {"; seen from ": " and ".join(texts[::-1]), "; never in ": listed(never)}
+    said["; hardly checked: "] = listed(link.get("unchecked", ()))
+    return "".join(what + names for what, names in said.items() if names)
 
 
 def _change(link: Mapping[str, Any]) -> str:

@@ -88,7 +88,7 @@ class Loop(Descent):
         start = start or Start()
         problem = problem.setting_aside(start.aside)
         if isinstance(prior, JointPrior):
-            problem = problem.resting_on(prior.rests_on)
+            problem = problem.resting_on(prior.rests_on, prior.variables)
         problem = with_spread(problem, start.spread(problem))
         super().__init__(problem, prior, progress, values_of(problem, start.state))
         self.given, self.start = self.problem, start

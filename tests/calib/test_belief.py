@@ -142,14 +142,17 @@ def test_what_moved_since_a_run_that_was_not_diagnosed_asks_for_that(run, tmp_pa
     """What its model lacks seems to move; where it was diagnosed, or nothing moved, no word."""
     numbers = {"parameters": ["tx"], "units": ["m"], "change": [0.01], "sigma": [1e-4]}
     arm = {"name": "arm_base", "moved": True, "p_value": 1e-6, "freed": 4.0, **numbers}
-    later = replace(run, model=run.model | {"prior": "earlier"}, folder=tmp_path / "later")
+    earlier = tmp_path / "earlier"
+    later = replace(run, model=run.model | {"prior": "../earlier"}, folder=tmp_path / "later")
 
-    def asked(**summary):
-        found = cautions(replace(later, summary=run.summary | summary))
+    def asked(*links):
+        found = cautions(replace(later, summary=run.summary | {"links": list(links)}))
         return [each for each in found if "was not diagnosed" in each]
 
-    (said,) = asked(links=[arm], prior_diagnosed=False)
-    assert f"'rigcal diagnose {later.prior}'" in said
-    assert not asked(links=[arm], prior_diagnosed=True)
-    assert not asked(links=[arm | {"moved": False}], prior_diagnosed=False)
-    assert not asked(links=[arm])  # a run of an earlier version
+    assert not asked(arm)  # it is gone
+    earlier.mkdir()
+    (said,) = asked(arm)
+    assert f"'rigcal diagnose {earlier}'" in said
+    assert not asked(arm | {"moved": False})
+    (earlier / "diagnosis.json").write_text("{}")
+    assert not asked(arm)

@@ -133,6 +133,8 @@ def test_what_rigs_of_other_names_share_may_have_moved_as_well(home, tmp_path, b
         (other / "rig.yaml").read_text().replace("frame: faro", "frame: b")
     )
     apart = fit([home / "before", other], tmp_path / "apart", hold_out="none")
+    sigma_m = [apart.solution.shared.frames[name].sigma_m for name in ("faro", "b")]
+    assert np.max(sigma_m) < 5e-4
     assert apart.converged and not [
         b for b in diagnose(apart).blunders if b["name"] in ("faro", "b")
     ]

@@ -193,11 +193,11 @@ def test_what_moved_is_told_from_what_did_not(run, printed):
     assert "tx +1.23 ± 0.45, ty -4.56 ± 0.12, tz +0.000 ± 0.021 mm; rx +1.20 ± 0.40" in text
     assert "mrad; p < 1e-06" in text
     assert "16 values by 3.00 rms mm; p = 2e-05" in text
-    seen = "p = 0.41; seen from 0.5 to 1200 mm, 0.2 mrad; hardly checked: ty"
-    assert f"not moved mount {seen} base_markers p = 0.2" in text
+    seen = "seen from 0.5 mm (at worst 1200) and 0.2 mrad; never in rz; hardly checked: ty"
+    assert f"not moved mount p = 0.41; {seen} base_markers p = 0.2" in text
     assert "lidar moved -4.56 ± 0.12 mm in y and turned -3.40 ± 0.50 mrad about y; ring" in text
     assert "changed by 3.00 mm rms; nothing else moved; the new data do not determine" in text
-    assert "arm_base; a move as large as CAD's sigma would not be seen in mount." in text
+    assert "arm_base; a move as large as CAD's sigma would not be seen in mount (ty)." in text
     none = " ".join(printed(tables.print_run, replace(run, summary=SUMMARY | {"links": []})))
     assert "nothing moved significantly." in none
 
