@@ -117,7 +117,10 @@ class Places:
             )
         if name in self.problem.variables:
             return name
-        T = start.reference_from_targets(self.part.source)
+        # Targets of another recording tell of the same frame.
+        others = (s for s in self.problem.sources if s.rig.reference_frame == name)
+        each = map(start.reference_from_targets, (self.part.source, *others))
+        T = next((T for T in each if T is not None), None)
         if T is None:
             T = self._reference_from_guess()
         self.problem.calibration.append(name)

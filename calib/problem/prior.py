@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,8 @@ class JointPrior:
         freed: the variables that may have moved since.
         rests_on: digests of measurements that the earlier estimate rests on; a fit from it does not
             count them again, see `Problem.resting_on`.
+        spreads: key of a spread, as of `calib.problem.spread` -> what it was then, and the sigma of
+            that: a few stops tell little of how widely stops scatter.
     """
 
     held: Sequence[Unknown]
@@ -32,6 +34,7 @@ class JointPrior:
     covariance: np.ndarray
     freed: frozenset[str] = frozenset()
     rests_on: frozenset[str] = frozenset()
+    spreads: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     name = "prior"
     kind = "prior"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 from calib.effects import FrameOffset
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
+from calib.problem.spread import names_of
 from calib.problem.unknowns import Unknown
 from calib.results.solution import Solution
 from calib.rig.suspect import listed
@@ -50,7 +51,22 @@ def earlier(
             "of the same rig"
         )
     covariance = solution.covariance[np.ix_(rows, rows)]
-    return JointPrior(held, means, covariance, rests_on=frozenset(rests_on))
+    spreads = dict(_earlier_spreads(problem, solution))
+    return JointPrior(held, means, covariance, rests_on=frozenset(rests_on), spreads=spreads)
+
+
+def _earlier_spreads(
+    problem: Problem, solution: Solution
+) -> Iterator[tuple[str, tuple[float, float]]]:
+    """Key of each spread that the earlier run estimated too, what it was, and the sigma of that."""
+    for source, terms in zip(problem.sources, problem.terms, strict=True):
+        known = solution.part(source.rig.name).effects
+        for term in (t for t in terms if t.effect.by_chance and t.effect.name in known):
+            effect = known[term.effect.name]
+            for key, spread in names_of(problem, term).items():
+                if spread.name in effect.names:
+                    at = effect.names.index(spread.name)
+                    yield key, (float(effect.estimate[at]), float(effect.sigma[at]))
 
 
 def change(prior: JointPrior, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -87,8 +87,10 @@ class Loop(Descent):
     ) -> None:
         start = start or Start()
         problem = problem.setting_aside(start.aside)
+        self._earlier: Mapping[str, tuple[float, float]] = {}  # spreads
         if isinstance(prior, JointPrior):
             problem = problem.resting_on(prior.rests_on, prior.variables)
+            self._earlier = prior.spreads
         problem = with_spread(problem, start.spread(problem))
         super().__init__(problem, prior, progress, values_of(problem, start.state))
         self.given, self.start = self.problem, start
@@ -234,10 +236,12 @@ class Loop(Descent):
             names = [u.name for u in some]
             found = told(some, self.values, self.graph.covariance(self.values, names))
             now = sds(some)
-            sd = found.spread(np.array(list(now.values())))
+            earlier = [self._earlier.get(key, (0.0, 0.0)) for key in now]
+            sd = found.spread(np.array(list(now.values())), earlier)
             out |= dict(zip(now, sd.tolist(), strict=True))
         if widening(self.problem):
-            out |= wider(self.problem, squares(self.as_it_stands(True, whole=True)))
+            sums = squares(self.as_it_stands(True, whole=True))
+            out |= wider(self.problem, sums, self._earlier)
         return {key: np.float64(sd) for key, sd in out.items()}
 
     def _met(self) -> dict[StopKey, np.ndarray]:

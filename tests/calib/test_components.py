@@ -10,8 +10,9 @@ from calib.problem import build
 from calib.problem.model import Model, Source
 from calib.problem.spread import spread_of
 from calib.simulation import Spec, simulate
-from calib.solve.components import spreads, squares
+from calib.solve.components import _as_rows, spreads, squares
 from calib.solve.components.checks import Checks
+from calib.solve.components.told import Told
 from calib.solve.fit import resume, solve
 
 SPEC = Spec(
@@ -248,3 +249,41 @@ def test_without_a_mesh_the_planes_are_no_bodies(tmp_path):
     assert of == {"base_markers", "mount_markers"}
     (p,) = (c["p_value"] for c in found.candidates if c["effect"] == "tracker_scatter")
     assert p >= 1e-6
+
+
+def test_few_values_leave_a_spread_near_what_an_earlier_run_knew():
+    """As a mean of squares, the earlier sd counting as so many values as have its sigma."""
+    x, (sd, sigma) = np.array([0.1, -0.2]), (3.0, 0.6)
+    seen = np.diag([1e8, 1e8])  # next to exactly
+    told = Told(seen @ x, seen, np.zeros(2, int))
+    (alone,) = told.spread(np.ones(1))
+    assert alone == pytest.approx(np.sqrt(np.mean(x**2)), rel=1e-3)
+    count = sd**2 / (2 * sigma**2)
+    (found,) = told.spread(np.ones(1), [(sd, sigma)])
+    assert found == pytest.approx(np.sqrt((x @ x + count * sd**2) / (2 + count)), rel=1e-3)
+    (unknown,) = told.spread(np.ones(1), [(0.0, 0.0)])
+    assert unknown == pytest.approx(alone, rel=1e-6)
+
+
+@pytest.mark.parametrize(("sigma", "beyond"), [(1.0, 0.0), (1.25, 0.75), (5.0, 4.9)])
+def test_what_no_row_tells_of_now_scatters_as_it_did(sigma, beyond):
+    """Whatever spread the fit begins with: of the first sigma, the earlier sd is beyond."""
+    first = np.sqrt(sigma**2 - beyond**2)
+    grown = _as_rows(sigma, beyond, 2.0, 0.3).growth()
+    assert np.sqrt((1 + grown) * sigma**2 - first**2) == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.long
+def test_one_new_stop_does_not_make_rings_certain_where_stops_scatter(tmp_path):
+    """By 3 mm, as the earlier run knew: the new stop's own zero is one draw of that."""
+    spec = Spec(lidar="hesai_pandarxt32", locations=4, column_step=200, world_seed=5)
+    simulate(spec, tmp_path / "first", 1, {"stop_range_scatter": 6.0})
+    few = Spec(**{**spec.model_dump(), "locations": 1, "stops_per_location": 1})
+    simulate(few, tmp_path / "later", 2, {"stop_range_scatter": 6.0})
+    known = fit(tmp_path / "first", tmp_path / "a", hold_out="none")
+    known = add(known, "stop_range_scatter", tmp_path / "b")
+    new = fit(tmp_path / "later", tmp_path / "c", hold_out="none", prior=tmp_path / "b")
+    before, after = (run.solution.shared.effects for run in (known, new))
+    (sd_then,), (sd_now,) = (each["stop_range_scatter"].estimate for each in (before, after))
+    rings_then, rings_now = (each["ring_range_offset"].sigma for each in (before, after))
+    assert sd_now > 0.7 * sd_then and (rings_now > 0.8 * rings_then).all()

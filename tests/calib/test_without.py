@@ -285,6 +285,14 @@ def test_of_several_recordings_it_is_said_which(box, places, tmp_path):
         assert each.lacks("frame") == {("cad", "lidar")}, "one LiDAR, however many recordings"
 
 
+def test_targets_of_a_later_recording_tell_an_earlier_one_where_the_scanner_is(box, tmp_path):
+    first, second = (shutil.copytree(box, tmp_path / name) for name in ("first", "second"))
+    (first / "targets.csv").unlink()
+    one = build([Source.open(second), Source.open(first)], MODEL).initial["faro"]
+    other = build([Source.open(first), Source.open(second)], MODEL).initial["faro"]
+    np.testing.assert_array_equal(one, other)
+
+
 def test_adding_nothing_and_leaving_nothing_out_is_refused(run, rigcal, tmp_path):
     code, out, err = rigcal("add", run.folder, "-o", tmp_path / "out")
     assert (code, out) == (2, "") and not (tmp_path / "out").exists()

@@ -133,14 +133,28 @@ def _of_cells(
     return {whose: Checks.alone(*np.sum(mine, axis=0)) for whose, mine in sums.items()}
 
 
-def wider(problem: Problem, sums: Sums) -> dict[str, float]:
-    """Key of a spread -> how widely rows scatter beyond their first sigma, as they have it."""
+def wider(
+    problem: Problem, sums: Sums, earlier: Mapping[str, tuple[float, float]]
+) -> dict[str, float]:
+    """Key of a spread -> how widely rows scatter beyond their first sigma, as they have it, and
+    other rows `earlier`: what these say, and the sigma of that."""
     out, known = {}, sigmas(problem)
     for key, whose in widening(problem).items():
         sigma, beyond = known[whose]
-        grown = sums.get(whose, NO_CHECKS).growth()
+        checks = sums.get(whose, NO_CHECKS)
+        if isinstance(checks, Checks) and earlier.get(key, (0.0, 0.0))[1] > 0.0:
+            checks = Checks.together([checks, _as_rows(sigma, beyond, *earlier[key])])
+        grown = checks.growth()
         out[key] = float(np.sqrt(max(grown * sigma**2 + beyond**2, 0.0)))
     return out
+
+
+def _as_rows(sigma: float, beyond: float, sd: float, sigma_sd: float) -> Checks:
+    """What other rows said of a spread, as so many rows, whitened by this sigma, as say the same;
+    `beyond` is what of that sigma is spread."""
+    variance = sigma**2 - beyond**2 + sd**2
+    count = variance**2 / (2.0 * (max(sd, sigma_sd) * sigma_sd) ** 2)
+    return Checks.alone(count * variance / sigma**2, count)
 
 
 def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:

@@ -68,13 +68,25 @@ class Told:
         """The same of rows that scatter so many times as widely as their sigmas say."""
         return replace(self, score=self.score / times**2, information=self.information / times**2)
 
-    def spread(self, start: np.ndarray) -> np.ndarray:
+    def spread(self, start: np.ndarray, earlier: Sequence[tuple[float, float]] = ()) -> np.ndarray:
         """The sd (G,) of each group.
 
         Args:
             start: (G,) sd to start from.
+            earlier: (G,) what other rows say of each, and the sigma of that; of sigma 0, nothing.
+                They count as so many values as have that sigma.
         """
-        return _likeliest(self.unlikely, start)
+        if not earlier:
+            return _likeliest(self.unlikely, start)
+        sd, sigma = np.array(earlier).T
+        dof = np.divide(sd**2, 2.0 * sigma**2, out=np.zeros(len(sd)), where=sigma > 0)
+
+        def unlikely(log_variance: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = self.unlikely(log_variance)
+            ratio = sd**2 / np.exp(log_variance)
+            return value + float(dof @ (log_variance + ratio)), slope + dof * (1.0 - ratio)
+
+        return _likeliest(unlikely, start)
 
     def unlikely(self, log_variance: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus the restricted log-likelihood, twice, and its derivative (G,) by the logs of the
