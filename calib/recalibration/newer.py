@@ -152,7 +152,7 @@ def moved_alone(prior: JointPrior, data: NewerData, name: str) -> tuple[int, flo
     data tell them apart."""
     (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
     best, k = int(np.argmax(block.each[0])), blocks_of(prior.held)[name]
-    answer = Force.of(prior, data).answer[k, k][best, best]
+    answer = Force.of(prior, data).answer[k, k][best, best] or np.inf  # of a mean alone: 0 by it
     unit = np.sqrt(np.diag(prior.covariance)[k][best]) / answer
     return best, float(unit * block.pull[best]), float(unit * np.sqrt(block.spread[best, best]))
 
