@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
 from calib.results.intervals import Intervals
 from calib.results.observability import not_estimated
+from calib.rig import Rig
 from calib.solve.components import spreads
 from calib.solve.estimate import Estimate
 from chains import se3
@@ -118,12 +120,25 @@ class Solution:
         return out
 
 
-def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = None) -> Solution:
+def _held_frames(rig: Rig) -> Iterator[tuple[str, FrameEstimate]]:
+    """Frames with a sigma where CAD has them, as they are where a fit holds them."""
+    for name, edge in zip(rig.tree.edge_names, rig.tree.edges, strict=True):
+        if name in rig.frame_sigma:
+            yield name, _pose(edge.parent, edge.T_parent_child, np.zeros((6, 6)))
+
+
+def solution_of(
+    problem: Problem,
+    estimate: Estimate,
+    known: Intervals | None = None,
+    earlier: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> Solution:
     """An estimate as frames and effects, with what it could not tell.
 
     Args:
         problem, estimate: what was estimated, and how it came out.
         known: the intervals of its variables, and of shapes; as the graph has them where None.
+        earlier: spreads that an earlier run knew, as of `JointPrior`.
     """
     told = graph = estimate.covariance
     if known is not None:
@@ -131,7 +146,7 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
         told, graph = mine.covariance, mine.graph
     start = np.cumsum([0] + [v.dim for v in estimate.variables])
     at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
-    shared, recordings, scatter = Part(), {}, spreads(estimate)
+    shared, recordings, scatter = Part(), {}, spreads(estimate, earlier)
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         rig = source.rig
         for term in terms:
@@ -146,14 +161,11 @@ def solution_of(problem: Problem, estimate: Estimate, known: Intervals | None = 
             else:
                 found = _effect(source, term, theta, covariance, _shape(term, known))
                 part.effects[term.effect.name] = found
-        if rig.reference_frame in at:
-            covariance = told[at[rig.reference_frame], at[rig.reference_frame]]
-            T = estimate.values[rig.reference_frame]
-            shared.frames[rig.reference_frame] = _pose(rig.world, T, covariance)
-        for name, edge in zip(rig.tree.edge_names, rig.tree.edges, strict=True):
-            there = name in shared.frames or name in recordings.get(rig.name, Part()).frames
-            if name in rig.frame_sigma and not there:
-                shared.frames[name] = _pose(edge.parent, edge.T_parent_child, np.zeros((6, 6)))
+        if (frame := rig.reference_frame) in at:
+            covariance = told[at[frame], at[frame]]
+            shared.frames[frame] = _pose(rig.world, estimate.values[frame], covariance)
+        there = shared.frames | recordings.get(rig.name, Part()).frames
+        shared.frames.update((n, held) for n, held in _held_frames(rig) if n not in there)
     effects = frozenset(
         t.variable
         for terms in problem.terms

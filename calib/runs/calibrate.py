@@ -259,7 +259,7 @@ def _fit(
     elsewhere = held.variables if held else ()  # an earlier run stands in place of CAD
     known = widened(known, estimate, seen, elsewhere)
     calibration = known.of([v.name for v in estimate.variables])
-    solution = solution_of(problem, estimate, known)
+    solution = solution_of(problem, estimate, known, held.spreads if held else {})
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     arrays |= {"names": np.array(solution.names), "rests_on": np.array(data, "S64")}
     np.savez(folder / COVARIANCE, **arrays)

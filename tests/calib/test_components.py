@@ -287,3 +287,5 @@ def test_one_new_stop_does_not_make_rings_certain_where_stops_scatter(tmp_path):
     (sd_then,), (sd_now,) = (each["stop_range_scatter"].estimate for each in (before, after))
     rings_then, rings_now = (each["ring_range_offset"].sigma for each in (before, after))
     assert sd_now > 0.7 * sd_then and (rings_now > 0.8 * rings_then).all()
+    (then,), (now,) = (each["stop_range_scatter"].sigma for each in (before, after))
+    assert 0.7 * then < now < 1.01 * then  # what one stop adds to it is little, and is not lost

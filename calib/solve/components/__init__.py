@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -157,8 +158,11 @@ def _as_rows(sigma: float, beyond: float, sd: float, sigma_sd: float) -> Checks:
     return Checks.alone(count * variance / sigma**2, count)
 
 
-def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
-    """Key of a spread, an unknown by chance or what widens rows -> that spread, and its sigma."""
+def spreads(
+    estimate: Estimate, earlier: Mapping[str, tuple[float, float]] = MappingProxyType({})
+) -> dict[str, tuple[float, float]]:
+    """Key of a spread, an unknown by chance or what widens rows -> that spread, and its sigma, as
+    all rows have it, and other rows `earlier`."""
     some, out = by_chance(estimate.problem), {}
     if some:
         found = told(some, estimate.values, estimate.covariance_of([u.name for u in some]))
@@ -172,6 +176,9 @@ def spreads(estimate: Estimate) -> dict[str, tuple[float, float]]:
             sigma, beyond = known[whose]
             checks = sums.get(whose, NO_CHECKS)
             out[key] = beyond, sigma_beyond(beyond, sigma**2 * checks.sigma(0.0))
+    for key in (key for key in out if earlier.get(key, (0.0, 0.0))[1] > 0.0):
+        (sd, sigma), (_, known_sigma) = out[key], earlier[key]
+        out[key] = sd, float(sigma * known_sigma / np.hypot(sigma, known_sigma))
     return out
 
 
