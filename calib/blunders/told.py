@@ -11,7 +11,6 @@ import numpy as np
 from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import TELLING, Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
-from calib.effects.rig import DOF
 from calib.problem.model import Source, labels, same_mesh
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
@@ -130,45 +129,6 @@ def not_as_drawn(moved: Mapping[str, Mapping[str, Any]]) -> Iterator[dict[str, A
             )
             off = {"size": off_rad, "unit": "rad", "sigma": found["sigma"]}
             yield {**otherwise("frame", name, CAD, whole(said)), **off}
-
-
-def of_link(
-    first: str,
-    later: str,
-    name: str,
-    way: tuple[str, float, float, str],
-    p: float,
-    instead: Sequence[str],
-    remedy: str,
-) -> dict[str, Any]:
-    """A link that moved between two recordings that were fitted as one rig's, in the same form.
-
-    Args:
-        first, later, name: what the recordings, and the link, are called.
-        way: its parameter that shows it best, or that all changed alike; by how much that changed,
-            with its sigma and unit.
-        p: of so large a change by chance.
-        instead, remedy: links of which one may have moved in its place; what to do, a clause.
-    """
-    parameter, change, sigma, unit = way
-    by = f"{parameter} by {'-' if change < 0 else ''}{size_told(abs(change), sigma, unit)}"
-    other = f" (or, in its place, {' or '.join(instead)})" if instead else ""
-    what = "moved" if parameter in DOF else "changed"
-    said = (
-        f"between {first} and {later} {name} {what}, {by}{other}, and one fit takes it for the "
-        f"same; {remedy}"
-    )
-    return {
-        **otherwise("frame", name, later, whole(said)),
-        "recording": later,
-        "size": abs(change),
-        "unit": unit,
-        "sigma": sigma,
-        "axis": parameter,
-        "p_value": at_least(p),
-        "p_adjusted": at_least(p),
-        "indistinguishable_from": list(instead),
-    }
 
 
 def of_recording(recording: str, other: str) -> dict[str, Any]:

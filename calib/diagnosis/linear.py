@@ -97,7 +97,8 @@ class Linear:
 
     @property
     def beams_drawn(self) -> list[str]:
-        """How many of the beams what is missing was looked for in, if not in all: a sentence."""
+        """A sentence that says in how many of the beams what is missing was looked for; none where
+        it was in all."""
         if self.looked == self.beams:
             return []
         share = f"{self.looked:,} of {self.beams:,} beams"

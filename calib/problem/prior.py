@@ -71,6 +71,8 @@ class JointPrior:
 
     def loosened(self, freed: Mapping[str, float]) -> JointPrior:
         """The same, where some variables have since moved by as many times their own sigma."""
+        if not freed:
+            return self
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return replace(self, covariance=covariance, freed=self.freed | freed.keys())

@@ -172,13 +172,15 @@ class Problem:
             for target, digest in source.measured_targets.items()
             if digest in known
         }
+        if not gone:
+            return self
 
         def rests(block: Block) -> bool:
             there = isinstance(block, HangingTarget) and block.groups[0].place in gone
             return there and {block.reference, *block.of_effects}.issubset(held)
 
         blocks = [block.without_sphere() if rests(block) else block for block in self.blocks]
-        return replace(self, blocks=blocks) if gone else self
+        return replace(self, blocks=blocks)
 
     def add(self, unknown: Unknown, value: np.ndarray | None = None) -> str:
         """Add an unknown once; it starts at `value`, or at its mean."""

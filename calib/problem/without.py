@@ -50,13 +50,13 @@ def leave_out(sources: Sequence[Source], tokens: Sequence[str]) -> list[Source]:
     for token in tokens:
         every = enumerate(zip(out, called, strict=True))
         found = [(i, g) for i, (s, label) in every for g in _matching(s, label, token)]
-        shared = _sharing_a_target([(out[i], g) for i, g in found], out, called)
-        found = shared or found
-        if len(shared) > 1 and all(group in out[i].without for i, group in shared):
+        target = _sharing_a_target([(out[i], g) for i, g in found], out, called)
+        found = target or found
+        if len(target) > 1 and all(group in out[i].without for i, group in target):
             continue  # by another of its names
         if any(group in out[i].without for i, group in found):
             raise InputError(f"--without {token}: that is left out already; name it once")
-        shared = shared or (found and found[0][1].where in (CAD, MESH))
+        shared = found and (target or found[0][1].where in (CAD, MESH))
         if not found or (len(found) > 1 and not shared):
             raise InputError(_refusal(out, token, [called[i] for i, _ in found]))
         for i, group in found:

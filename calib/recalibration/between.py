@@ -6,10 +6,12 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from calib.blunders import told
+from calib.blunders.chance import at_least
 from calib.blunders.mixed import mixed_targets
+from calib.blunders.told import of_recording, otherwise, size_told, whole
 from calib.diagnosis.search import Search
 from calib.diagnosis.stand import Stand
+from calib.effects.rig import DOF
 from calib.problem import build
 from calib.problem.model import Model, Source, labels
 from calib.recalibration.letgo import ALARM
@@ -89,7 +91,7 @@ def moved_between(
             alone = {label: _alone(model, named[label], progress) for label in ask}
         bad = [label for label, each in alone.items() if each.can_fit and not each.known]
         first = next((label for label in mine if label not in alone or alone[label].known), None)
-        yield from (told.of_recording(label, first or before) for label in bad if first or before)
+        yield from (of_recording(label, first or before) for label in bad if first or before)
         if first is None:
             continue
         for label in (each for each in mine if each not in (first, *bad)):
@@ -120,21 +122,39 @@ def _names_in_all(stand: Stand, label: str) -> dict[str, str]:
 
 
 def _told(stand: Stand, first: str, later: str, link: Link, remedy: str) -> dict[str, Any]:
-    """As a blunder, by the parameter, or the mean of them, that shows it best."""
-    best, name = link.parameters.index(link.shown_by), _names_in_all(stand, later)
-    way = link.shown_by, *link.alone, link.units[best]
+    """A link that moved between two recordings that one fit takes for the same, as a blunder: by
+    its parameter that shows it best, had that alone moved, or by how much all changed alike.
+
+    Args:
+        stand: of that fit.
+        first, later: what the recordings are called.
+        link: it.
+        remedy: what to do, a clause.
+    """
+    names, unit = _names_in_all(stand, later), link.units[link.parameters.index(link.shown_by)]
+    axis, (change, sigma) = link.shown_by, link.alone
     if link.of_mean:
-        way = "all alike", *link.of_mean, link.units[0]
-    of_scanner = link.name in {source.rig.reference_frame for source in stand.sources}
-    return told.of_link(
-        first,
-        later,
-        name.get(link.name, link.name),
-        way,
-        p=link.p_value,
-        instead=[name.get(each, each) for each in link.instead],
-        remedy=f"{remedy}, or {OTHER_FRAME}" if of_scanner else remedy,
+        axis, (change, sigma) = "all alike", link.of_mean
+    name, *instead = (names.get(each, each) for each in (link.name, *link.instead))
+    if link.name in {source.rig.reference_frame for source in stand.sources}:
+        remedy = f"{remedy}, or {OTHER_FRAME}"
+    by = f"{axis} by {'-' if change < 0 else ''}{size_told(abs(change), sigma, unit)}"
+    other = f" (or, in its place, {' or '.join(instead)})" if instead else ""
+    said = (
+        f"between {first} and {later} {name} {'moved' if axis in DOF else 'changed'}, {by}{other}, "
+        f"and one fit takes it for the same; {remedy}"
     )
+    return {
+        **otherwise("frame", name, later, whole(said)),
+        "recording": later,
+        "size": abs(change),
+        "unit": unit,
+        "sigma": sigma,
+        "axis": axis,
+        "p_value": at_least(link.p_value),
+        "p_adjusted": at_least(link.p_value),
+        "indistinguishable_from": instead,
+    }
 
 
 def _alone(model: Model, source: Source, progress: Progress) -> _Alone:

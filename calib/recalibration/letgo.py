@@ -117,14 +117,10 @@ def _settled(
         free, now: what the first of them let go, and that fit.
         limit: p-value of a link from which on it is beyond chance.
     """
-
-    def without(free: Mapping[str, float]) -> JointPrior:
-        return prior.loosened(free) if free else prior
-
     fits: list[dict[str, float]] = []
     last = False
     while True:
-        found = _Moves.of(prior, NewerData.of(without(free), now), limit).free
+        found = _Moves.of(prior, NewerData.of(prior.loosened(free), now), limit).free
         if last or _alike(found, free):
             break
         fits.append(free)
@@ -133,14 +129,14 @@ def _settled(
         if last and _alike(both, free):
             break
         free = both if last else found
-        now = fit(without(free))
+        now = fit(prior.loosened(free))
         last = last or not now.converged
     tried = frozenset(name for each in (*fits, free) for name in each)
-    data = NewerData.of(without(free), now.at_least)
+    data = NewerData.of(prior.loosened(free), now.at_least)
     moves = _Moves.of(prior, data, limit)
     if moves.free.keys() != free.keys():
         free = moves.free
-        fit(without(free))
+        fit(prior.loosened(free))
     return _Settled(data, moves, free, tried)
 
 

@@ -123,12 +123,11 @@ def tests(prior: JointPrior, data: NewerData) -> dict[str, float | None]:
     """
     found = {}
     for v, block in _pulls(prior, data):
-        found[v.name] = _test(block)
+        found[v.name] = block.p_value
         if v.of_members and v.dim > 1:
-            mean = _test(block.mean)
             single, told = block.each
             least = told.sum() * float(chdtrc(1, single.max())) if told.any() else None
-            several = [p for p in (found[v.name], mean, least) if p is not None]
+            several = [p for p in (block.p_value, block.mean.p_value, least) if p is not None]
             found[v.name] = min(1.0, len(TESTS_OF_MEMBERS) * min(several)) if several else None
     return found
 
@@ -151,9 +150,9 @@ def moved_alone(prior: JointPrior, data: NewerData, name: str) -> tuple[int, flo
     of that; arguments as of `tests`. All of a link let go, what moved shows in others too, as the
     data tell them apart."""
     (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
-    best, k = int(np.argmax(block.each[0])), blocks_of(prior.held)[name]
-    answer = Force.of(prior, data).answer[k, k][best, best] or np.inf  # of a mean alone: 0 by it
-    unit = np.sqrt(np.diag(prior.covariance)[k][best]) / answer
+    best = int(np.argmax(block.each[0]))
+    answer = block.answer[best, best] or np.inf  # of a mean alone: 0 by it
+    unit = np.sqrt(np.diag(prior.covariance)[blocks_of(prior.held)[name]][best]) / answer
     return best, float(unit * block.pull[best]), float(unit * np.sqrt(block.spread[best, best]))
 
 
@@ -169,18 +168,14 @@ def told_from(prior: JointPrior, data: NewerData, limit: float) -> dict[str, np.
         prior, data: as of `tests`.
         limit: p-value from which on a link has moved.
     """
-    answer, found = Force.of(prior, data).answer, {}
-    unit, blocks = np.sqrt(np.diag(prior.covariance)), blocks_of(prior.held)
+    unit, blocks, found = np.sqrt(np.diag(prior.covariance)), blocks_of(prior.held), {}
     for v, block in _pulls(prior, data):
-        k = blocks[v.name]
-        of_each = answer[k, k]
         if v.of_members and v.dim > 1:
             share = limit / len(TESTS_OF_MEMBERS)
-            alone = block.seen_from_alone(np.diag(of_each), share)
-            least = np.minimum(block.seen_from(of_each, share), alone)
+            least = np.minimum(block.seen_from(share), block.seen_from_alone(share))
         else:
-            least = block.seen_from(of_each, limit)
-        found[v.name] = unit[k] * least
+            least = block.seen_from(limit)
+        found[v.name] = unit[blocks[v.name]] * least
     return found
 
 
@@ -195,10 +190,11 @@ def left_by_moves(prior: JointPrior, data: NewerData) -> np.ndarray:
 
 
 class _Pull(NamedTuple):
-    """How the prior pulls at a link: a pull (n,) ~ N(0, spread) where nothing moved, and the weight
-    (n, n) of the prior there."""
+    """How the prior pulls at a link, as of `Force`: a pull (n,) ~ N(0, spread) where nothing moved,
+    how it answers to moves, and the weight of the prior there (n, n)."""
 
     pull: np.ndarray
+    answer: np.ndarray
     spread: np.ndarray
     weight: np.ndarray
 
@@ -207,6 +203,12 @@ class _Pull(NamedTuple):
         """That of the test, and its degrees of freedom."""
         unit = self._units()
         return float(np.square(unit @ self.pull).sum()), len(unit)
+
+    @property
+    def p_value(self) -> float | None:
+        """Of the test; None where nothing but the prior holds the link."""
+        statistic, dof = self.statistic
+        return float(chdtrc(dof, statistic)) if dof else None
 
     @property
     def each(self) -> tuple[np.ndarray, np.ndarray]:
@@ -221,16 +223,18 @@ class _Pull(NamedTuple):
         of_all = np.ones((1, len(self.pull)))
         return _Pull(of_all @ self.pull, *(of_all @ m @ of_all.T for m in self[1:]))
 
-    def seen_from(self, answer: np.ndarray, limit: float) -> np.ndarray:
-        """See `told_from`; `answer` (n, n) is by how much a move of each parameter pulls more."""
+    def seen_from(self, limit: float) -> np.ndarray:
+        """How far (n,) a parameter has to move for the test to tell it; see `told_from`."""
         unit = self._units()
-        return self._enough(np.square(unit @ answer).sum(axis=0), len(unit), limit)
+        return self._enough(np.square(unit @ self.answer).sum(axis=0), len(unit), limit)
 
-    def seen_from_alone(self, answer: np.ndarray, limit: float) -> np.ndarray:
-        """The same of tests of each parameter by itself, which share the limit; `answer` (n,)."""
-        told, spread = self._told_alone, np.diag(self.spread)
-        seen = np.divide(np.square(answer), spread, out=np.zeros(len(answer)), where=told)
-        return self._enough(seen, int(told.any()), limit / max(1, told.sum()))
+    def seen_from_alone(self, limit: float) -> np.ndarray:
+        """The same of tests of each parameter by itself, which share the limit."""
+        told, answer = self._told_alone, np.diag(self.answer)
+        of_unit = np.divide(
+            np.square(answer), np.diag(self.spread), out=np.zeros(len(told)), where=told
+        )
+        return self._enough(of_unit, int(told.any()), limit / max(1, told.sum()))
 
     def _enough(self, of_unit: np.ndarray, dof: int, limit: float) -> np.ndarray:
         """How large (n,) a move has to be, where one of a unit makes the statistic of a test of so
@@ -259,13 +263,8 @@ def _pulls(prior: JointPrior, data: NewerData) -> Iterator[tuple[Unknown, _Pull]
     force, blocks = Force.of(prior, data), blocks_of(prior.held)
     for v in prior.held:
         k = blocks[v.name]
-        yield v, _Pull(force.pull[k], force.spread[k, k], force.weight[k, k])
-
-
-def _test(pull: _Pull) -> float | None:
-    """The p-value; None where nothing but the prior holds the link."""
-    statistic, dof = pull.statistic
-    return float(chdtrc(dof, statistic)) if dof else None
+        whole = (force.answer[k, k], force.spread[k, k], force.weight[k, k])
+        yield v, _Pull(force.pull[k], *whole)
 
 
 def blocks_of(variables: Sequence[Unknown]) -> dict[str, slice]:

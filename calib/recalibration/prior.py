@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.effects import FrameOffset
+from calib.effects import FrameOffset, Site
 from calib.problem import Problem
 from calib.problem.prior import JointPrior
 from calib.problem.spread import names_of
@@ -58,10 +58,12 @@ def earlier(
 def _earlier_spreads(
     problem: Problem, solution: Solution
 ) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Key of each spread that the earlier run estimated too, what it was, and the sigma of that."""
+    """Key of each spread that the earlier run estimated too, what it was, and the sigma of that;
+    none of joint readings, whose spreads are estimated together, from these recordings alone."""
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         known = solution.part(source.rig.name).effects
-        for term in (t for t in terms if t.effect.by_chance and t.effect.name in known):
+        drawn = (t for t in terms if t.effect.by_chance and t.effect.site is not Site.JOINTS)
+        for term in (t for t in drawn if t.effect.name in known):
             effect = known[term.effect.name]
             for key, spread in names_of(problem, term).items():
                 if spread.name in effect.names:

@@ -18,7 +18,6 @@ from sensors.stops import Targets
 
 # A choice: the end of a rod of 0.2 m is then 10 mm off, where markers are known to tenths of one.
 ASKEW_RAD = np.radians(3.0)
-FEWEST_TARGETS = 3  # targets that fix a pose
 APART_M = 0.01  # a choice: tracker and scanner place spheres to better than a tenth of that
 # Of how far spheres lie apart, what is left where they are mirrored: a choice. All of 0.27 m but
 # 1 mm went where they were.
@@ -43,7 +42,7 @@ def mixed_up(targets: Targets, spec: TargetSpec) -> list[Suspect]:
     other hand."""
     parts = targets.faro_m, targets.upper_m, targets.lower_m
     whole = np.isfinite(np.hstack(parts)).all(axis=1)
-    if whole.sum() < FEWEST_TARGETS:
+    if not whole.any():
         return []
     names = [name for name, kept in zip(targets.names, whole, strict=True) if kept]
     odd = odd_targets(Targets(names, *(part[whole] for part in parts)), spec)

@@ -143,7 +143,7 @@ def wider(
     for key, whose in widening(problem).items():
         sigma, beyond = known[whose]
         checks = sums.get(whose, NO_CHECKS)
-        if isinstance(checks, Checks) and earlier.get(key, (0.0, 0.0))[1] > 0.0:
+        if earlier.get(key, (0.0, 0.0))[1] > 0.0:
             checks = Checks.together([checks, _as_rows(sigma, beyond, *earlier[key])])
         grown = checks.growth()
         out[key] = float(np.sqrt(max(grown * sigma**2 + beyond**2, 0.0)))
