@@ -1,5 +1,5 @@
-"""What of a recording is written under the wrong name, or in the wrong hand, so that no fit to it
-comes to an optimum: told in place of all that this drags along."""
+"""Targets under each other's names, or mirrored: no fit to them comes to an optimum, and everything
+else that then stands out may follow from that."""
 
 from __future__ import annotations
 

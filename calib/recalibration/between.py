@@ -43,8 +43,9 @@ class _Alone(NamedTuple):
 def contradictions(
     stand: Stand, found: Search, converged: bool, progress: Progress
 ) -> list[dict[str, Any]]:
-    """What drags all else along, as blunders of `diagnosis.json`: targets that are mixed up, where
-    a fit has not converged, or else what recordings contradict each other by.
+    """What everything else that stands out may follow from, as blunders of `diagnosis.json`:
+    targets that are mixed up, where a fit has not converged, or else what recordings contradict
+    each other by.
 
     Args:
         stand: a model, fitted to all recordings.

@@ -151,7 +151,7 @@ def moved_alone(prior: JointPrior, data: NewerData, name: str) -> tuple[int, flo
     data tell them apart."""
     (block,) = (block for v, block in _pulls(prior, data) if v.name == name)
     best = int(np.argmax(block.each[0]))
-    answer = block.answer[best, best] or np.inf  # of a mean alone: 0 by it
+    answer = block.answer[best, best] or np.inf  # only the mean is told: no size
     unit = np.sqrt(np.diag(prior.covariance)[blocks_of(prior.held)[name]][best]) / answer
     return best, float(unit * block.pull[best]), float(unit * np.sqrt(block.spread[best, best]))
 
