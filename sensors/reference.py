@@ -5,6 +5,7 @@ to its own centre. Range, point, normal and incidence are then computed in float
 triangle's plane, so a residual and its derivatives agree as doubles wherever the mesh lies.
 """
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -198,6 +199,14 @@ class Reference:
                 off_m = _dot(plane, origins_m) + range_m * _dot(plane, turned) - plane[:, 3]
                 near |= ~(np.abs(off_m) <= DEPTH_STEP_M)
         return near & (hits.triangle >= 0)
+
+    @cached_property
+    def digest(self) -> str:
+        """Of its triangles and their labels, by which its parts are numbered."""
+        sha = hashlib.sha256()
+        for each in (self.vertices_m, self.triangles, self.label):
+            sha.update(np.ascontiguousarray(each).tobytes())
+        return sha.hexdigest()
 
     @cached_property
     def surface(self) -> np.ndarray:

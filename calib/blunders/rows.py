@@ -148,7 +148,7 @@ def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]
     for block, by, b in graph_rows:
         if not isinstance(block, HangingTarget):
             continue
-        weight = np.repeat(np.ones(3) if block.weight is None else block.weight, 3)
+        weight = block.weights
         root = np.sqrt(np.where(weight > 0, weight, 1.0))
         every = np.split(_off_rod(block, whole.values), np.cumsum([3, 2]), axis=1)
         parts = {
@@ -162,7 +162,7 @@ def _targets(whole: Linearisation, graph_rows: GraphRows) -> Iterator[GroupRows]
             columns=whole.layout.columns(list(by)),
             b=b / root,
             weight=np.square(root),
-            sigma=np.repeat([block.sigma_marker_m, block.sigma_marker_m, block.sigma_sphere_m], 3),
+            sigma=block.sigmas_m,
             axes=("x", "y", "z") * 3,
             units=("m",) * 9,
             groups=parts | rod if len(parts) > 1 else parts,

@@ -11,7 +11,8 @@ import numpy as np
 from calib.blunders.chance import LEAST_P, at_least
 from calib.blunders.judged import TELLING, Blunder, LeftOut
 from calib.blunders.reach import FurthestMoved
-from calib.problem.model import Source, labels, same_mesh
+from calib.problem.beams import same_mesh
+from calib.problem.model import Source, labels
 from calib.residuals.groups import ALONG_BEAMS, CAD, JOINTS, MESH, SCAN, Group
 from calib.residuals.surfaces import part_centre_m
 from calib.rig import Rig

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from calib.effects import Site
-from calib.problem.model import Source, same_mesh
+from calib.problem.model import Source
 from calib.problem.places import Places
 from calib.problem.problem import Problem, SourceStops
 from calib.problem.surfaces import LEAST_BEAMS
@@ -18,6 +18,7 @@ from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, MeshSurface, Plan
 from chains import se3
 from chains.errors import InputError
 from sensors.planes import PlaneFinder, Planes
+from sensors.reference import Reference
 
 Progress = Callable[[str, int, int], None]
 OF_BEAMS = (Site.BEAM, Site.REFERENCE, Site.NOISE)
@@ -126,3 +127,10 @@ def _find_planes(problem: Problem, part: SourceStops, places: Places, progress: 
             f"add reference/mesh.ply, or scan walls"
         )
     return planes
+
+
+def same_mesh(a: Reference | None, b: Reference | None) -> bool:
+    """Whether two references are one: their errors are then the same too."""
+    if a is None or b is None or a is b:
+        return a is b
+    return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)

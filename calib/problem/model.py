@@ -39,6 +39,8 @@ class Model:
         without: what of the recordings is left out, as `Group.token` names it.
         beams: how many beams of each scan are used at most; all where None.
         moved: unknowns that moved since CAD told of them, each by how many of its sigmas.
+        starts: frames of the reference, each with its pose in the world (x y z qw qx qy qz) as an
+            earlier run has it: where it starts if no recording tells where it is.
     """
 
     effects: tuple[Effect, ...] = effects.DEFAULT
@@ -46,6 +48,7 @@ class Model:
     without: tuple[str, ...] = ()
     beams: int | None = None
     moved: Mapping[str, float] = field(default_factory=dict, hash=False)
+    starts: Mapping[str, tuple[float, ...]] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         chosen = (effects.find(e) if isinstance(e, str) else e for e in self.effects)
@@ -102,7 +105,9 @@ class Model:
         """
         found = tuple(effects.read(effect, path, trust) for effect in document["effects"])
         left_out = tuple(document.get("without", ()))
-        return cls(found, tuple(document["fixed"]), left_out, document.get("beams"))
+        starts = {n: tuple(map(float, pose)) for n, pose in document.get("starts", {}).items()}
+        fixed, beams = tuple(document["fixed"]), document.get("beams")
+        return cls(found, fixed, left_out, beams, starts=starts)
 
     def document(self) -> dict[str, Any]:
         """As model.yaml holds it."""
@@ -111,7 +116,8 @@ class Model:
             "fixed": list(self.fixed),
             "without": list(self.without),
         }
-        return out if self.beams is None else {**out, "beams": self.beams}
+        out |= {} if self.beams is None else {"beams": self.beams}
+        return out | ({"starts": {n: [*T] for n, T in self.starts.items()}} if self.starts else {})
 
     def plus(self, added: Sequence[Effect]) -> Model:
         """The model with more effects.
@@ -389,10 +395,3 @@ def labels(sources: Sequence[Source]) -> list[str]:
         if len(set(found)) == len(found):
             break
     return found
-
-
-def same_mesh(a: Reference | None, b: Reference | None) -> bool:
-    """Whether two references are one: their errors are then the same too."""
-    if a is None or b is None or a is b:
-        return a is b
-    return np.array_equal(a.vertices_m, b.vertices_m) and np.array_equal(a.triangles, b.triangles)

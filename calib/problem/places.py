@@ -135,9 +135,13 @@ class Places:
         T = start.reference_from_targets(source.whole)  # good enough to start from
         if T is not None:
             return T
+        known = self.model.starts.get(source.rig.reference_frame)
+        if known is not None:
+            return se3.from_xyz_quat(known[:3], known[3:])
         raise InputError(
             f"{source.recording.folder}: nothing ties '{source.rig.reference_frame}' to "
-            f"'{source.rig.world}'; add targets.csv, or base_guess columns to stops.csv."
+            f"'{source.rig.world}'; add targets.csv, or base_guess columns to stops.csv, or give a "
+            "run that knows it as --prior."
         )
 
     def _add_root(self, name: str, stops: np.ndarray) -> None:

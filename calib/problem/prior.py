@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -12,6 +13,43 @@ from scipy.linalg import cholesky, solve_triangular
 from calib.forward import Derivatives, Values
 from calib.problem.unknowns import Unknown
 from chains import se3
+
+COMMON_OF, COMMON_BY = "common_of", "common_by"  # names of arrays in a file
+
+
+class CommonErrors(NamedTuple):
+    """How an estimate goes with errors that another run may share, as it rests on the same mesh, or
+    on the same scan of the spheres: each is the same in both, so what they make does not average
+    out.
+
+    Args:
+        of: (M,) what errs: a part of a mesh, or an axis of a sphere, by what was measured.
+        by: (M, P) by how much each parameter is off for a unit of each, in their units.
+    """
+
+    of: np.ndarray
+    by: np.ndarray
+
+    @classmethod
+    def none(cls, parameters: int) -> Self:
+        """Of an estimate of so many parameters that goes with none."""
+        return cls(np.zeros(0, "U1"), np.zeros((0, parameters)))
+
+    @classmethod
+    def read(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
+        """From the arrays of a file; None where an earlier version wrote it."""
+        if not {COMMON_OF, COMMON_BY} <= arrays.keys():
+            return None
+        return cls(np.char.decode(arrays[COMMON_OF]), arrays[COMMON_BY].astype(float))
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As a file has them."""
+        return {COMMON_OF: np.char.encode(self.of), COMMON_BY: self.by.astype(np.float32)}
+
+    def at(self, parameters: np.ndarray) -> CommonErrors:
+        """The same of some of the parameters (n,)."""
+        return self._replace(by=self.by[:, parameters])
 
 
 @dataclass(frozen=True)
@@ -27,6 +65,7 @@ class JointPrior:
             count them again, see `Problem.resting_on`.
         spreads: key of a spread, as of `calib.problem.spread` -> what it was then, and the sigma of
             that: a few stops tell little of how widely stops scatter.
+        common: how the means go with errors that the newer data may share.
     """
 
     held: Sequence[Unknown]
@@ -35,6 +74,7 @@ class JointPrior:
     freed: frozenset[str] = frozenset()
     rests_on: frozenset[str] = frozenset()
     spreads: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    common: CommonErrors | None = None
 
     name = "prior"
     kind = "prior"
@@ -76,6 +116,16 @@ class JointPrior:
         moved = [freed.get(v.name, 0.0) * v.sigma for v in self.held]
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return replace(self, covariance=covariance, freed=self.freed | freed.keys())
+
+    def off_by(self, rows: np.ndarray) -> CommonErrors | None:
+        """How an estimate from this prior goes with the errors that its means go with.
+
+        Args:
+            rows: (P, Q) the rows of the prior, times the covariance of the Q parameters of that
+                estimate.
+        """
+        by = self.common and self.common.by @ self._root.T @ rows
+        return self.common and self.common._replace(by=by)
 
     @cached_property
     def _root(self) -> np.ndarray:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from calib.effects import FrameOffset, Site
 from calib.problem import Problem
+from calib.problem.model import Model, Source
 from calib.problem.prior import JointPrior
 from calib.problem.spread import names_of
 from calib.problem.unknowns import Unknown
@@ -51,8 +53,24 @@ def earlier(
             "of the same rig"
         )
     covariance = solution.covariance[np.ix_(rows, rows)]
-    spreads = dict(_earlier_spreads(problem, solution))
-    return JointPrior(held, means, covariance, rests_on=frozenset(rests_on), spreads=spreads)
+    return JointPrior(
+        held,
+        means,
+        covariance,
+        rests_on=frozenset(rests_on),
+        spreads=dict(_earlier_spreads(problem, solution)),
+        common=solution.common.at(np.array(rows)) if solution.common else None,
+    )
+
+
+def starting_from(model: Model, solution: Solution, sources: Iterable[Source]) -> Model:
+    """A model whose frames of the reference start where an earlier run has them, if no recording
+    tells where they are."""
+    known, out = solution.shared.frames, {}
+    for name in (s.rig.reference_frame for s in sources if s.rig.reference_frame in known):
+        T = known[name].T_parent_child
+        out[name] = (*T[:3, 3].tolist(), *se3.to_quat_wxyz(T).tolist())
+    return replace(model, starts=out)
 
 
 def _earlier_spreads(

@@ -47,7 +47,7 @@ def solve_from(
         known = intervals(freed, progress)
         seen = errors_at(estimate.problem, estimate.values)
         wide = widened(known, estimate, seen, prior.variables)
-        held, at_least = (each.of(prior.variables) for each in (known, wide))
+        held, at_least = (each.of(prior.variables).apart for each in (known, wide))
         moved, turned = change(prior, estimate.values)
         covariances = (held.graph, held.covariance, at_least.covariance)
         graph, covariance, widest = (turned @ each @ turned.T for each in covariances)

@@ -13,7 +13,8 @@ import numpy as np
 from calib.forward import Values
 from calib.linear.parallel import over_stops
 from calib.problem import Problem
-from calib.problem.model import Source, same_mesh
+from calib.problem.beams import same_mesh
+from calib.problem.model import Source
 from calib.recalibration.links import moved_since_cad
 from calib.report.budget import Budget, budget
 from calib.report.statistics import (

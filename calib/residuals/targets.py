@@ -71,6 +71,21 @@ class HangingTarget:
     def variables(self) -> tuple[str, ...]:
         return (self.marker, self.gravity, self.reference, *self.of_effects)
 
+    @property
+    def measured_m(self) -> np.ndarray:
+        """(3, 3) of each of `TARGET_PARTS`: markers in the world, the sphere in faro."""
+        return np.stack([self.lower_m, self.upper_m, self.faro_m])
+
+    @property
+    def sigmas_m(self) -> np.ndarray:
+        """(9,) of its rows."""
+        return np.repeat([self.sigma_marker_m, self.sigma_marker_m, self.sigma_sphere_m], 3)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(9,) of its rows."""
+        return np.ones(self.rows) if self.weight is None else np.repeat(self.weight, 3)
+
     def without_sphere(self) -> HangingTarget:
         """The target where its sphere says nothing."""
         weight = np.ones(len(TARGET_PARTS)) if self.weight is None else self.weight
@@ -95,14 +110,8 @@ class HangingTarget:
         R_t = T[:3, :3].T
         in_faro = R_t @ (sphere - T[:3, 3])
         scanned = self.faro_m + sum(b @ values[n] for n, b in self.scanned.items())
-        residual = np.concatenate(
-            [
-                (lower - p) / self.sigma_marker_m,
-                across / self.sigma_marker_m,
-                (scanned - in_faro) / self.sigma_sphere_m,
-            ]
-        )
-        root = 1.0 if self.weight is None else np.sqrt(np.repeat(self.weight, 3))
+        residual = np.concatenate([lower - p, across, scanned - in_faro]) / self.sigmas_m
+        root = np.sqrt(self.weights)
         if not derivatives:
             return root * residual, None
         found = self._derivatives(g, rod, R_t, in_faro)

@@ -24,6 +24,14 @@ where rows err alone, 0.97 to 0.99.
 Of a ring half or more of whose beams are rejected the others may agree by chance: its interval is
 that from before the fit.
 
+Errors of the mesh, and of spheres as they were scanned, are the same in all runs that rest on them.
+They reach an estimate whose prior is an earlier run by two ways, by what that run said and by the
+newer rows; and so does a sphere that was scanned once, and tracked anew for each of two recordings
+of one fit. The graph takes them for different errors. With s_i how the estimate goes with an error
+by way i, and d the variance of the error, what it leaves out is ``d (sum_i s_i) (sum_i s_i)^T - d
+sum_i s_i s_i^T``. That is added. The estimate itself stays that of the graph (the consider
+covariance: Schmidt 1966; Tapley, Schutz and Born 2004, Statistical Orbit Determination, ch. 6).
+
 Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
 
@@ -32,6 +40,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,8 +50,10 @@ from calib.linear.clusters import ClusteredRows, Gradients
 from calib.linear.own import own_rows
 from calib.linear.rows import PLACES
 from calib.problem import Problem
-from calib.problem.prior import JointPrior
+from calib.problem.prior import CommonErrors, JointPrior
+from calib.problem.problem import Block
 from calib.problem.unknowns import Role
+from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
@@ -70,6 +81,8 @@ class Intervals:
         least: how many times larger than their sigmas the errors of rows are, at least 1: all but
             what is due to `given` is so much wider.
         cad: how many times wider than stated values of CAD scatter, at least 1.
+        shared: (Q, Q) what errors add that reach the estimate by several ways; 0 where none does.
+        common: how it goes with errors that another run may share.
     """
 
     names: tuple[str, ...]
@@ -79,8 +92,16 @@ class Intervals:
     paper: np.ndarray
     given: np.ndarray
     wider: np.ndarray
+    shared: np.ndarray
+    common: CommonErrors
     least: float = 1.0
     cad: float = 1.0
+
+    @property
+    def apart(self) -> Intervals:
+        """The same, as if each way by which an error reaches the estimate had an error of its own:
+        the covariance that the graph's weights have."""
+        return replace(self, shared=np.zeros_like(self.shared))
 
     @property
     def covariance(self) -> np.ndarray:
@@ -93,7 +114,8 @@ class Intervals:
         root = np.sqrt(
             np.where(share > ROUNDED_SHARE, more / np.maximum(share, ROUNDED_SHARE), 0.0)
         )
-        return least + np.outer(root, root) * self.data + (self.cad**2 - 1.0) * self.paper
+        wider = np.outer(root, root) * self.data + (self.cad**2 - 1.0) * self.paper
+        return least + wider + self.shared
 
     def of(self, names: Sequence[str]) -> Intervals:
         """Those of some of the unknowns, in the order given."""
@@ -108,6 +130,8 @@ class Intervals:
             data=self.data[np.ix_(some, some)],
             paper=self.paper[np.ix_(some, some)],
             given=self.given[np.ix_(some, some)],
+            shared=self.shared[np.ix_(some, some)],
+            common=self.common.at(some),
             wider=self.wider[some],
         )
 
@@ -192,18 +216,16 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     sigma = np.sqrt(np.diag(estimate.kept))
     directions = linear.followed(estimate.kept / sigma)
     sums = ClusterSums.over(estimate.kept / np.outer(sigma, sigma))
-    places, stops = Gradients(layout.size), len(layout.stops)
-    problem, met = estimate.problem, estimate.associations
-    tell = partial(progress, "errors in common of rows")
+    problem, places, stops = estimate.problem, Gradients(layout.size), len(layout.stops)
     beams = BeamsAlong(
         problem=problem,
         layout=layout,
         values=values,
-        associations=met,
+        associations=estimate.associations,
         directions=directions,
         places=places,
         kinds=ROOM_PARTS,
-        progress=tell,
+        progress=partial(progress, "errors in common of rows"),
     )
     for cells, scatter in beams.cells():
         sums.add_stop(cells, scatter)
@@ -226,12 +248,12 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     b, stop, place = (
         np.concatenate([getattr(r, k) for r in others]) for k in ("b", "stop", "place")
     )
-    every = np.arange(directions.shape[1])
-    sums.add(ClusteredRows(A=A, b=b, columns=every, stop=stop, place=place))
+    sums.add(ClusteredRows(A=A, b=b, columns=np.arange(A.shape[1]), stop=stop, place=place))
     wider = sums.wider()
     for name, lost in estimate.not_trusted.items():
         at = np.searchsorted(layout.kept, layout.columns([name])[lost])
         wider[at] = np.maximum(wider[at], before[name][lost] / sigma[at])
+    shared, common = _in_common(estimate, directions * sigma)
     return Intervals(
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),
@@ -240,7 +262,76 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         paper=paper * np.outer(sigma, sigma),
         given=given * np.outer(sigma, sigma),
         wider=wider,
+        shared=shared,
+        common=common,
     )
+
+
+class Way(NamedTuple):
+    """A way by which errors of these variances (M,) reach an estimate; where the variance is that
+    of another way, 0."""
+
+    errors: CommonErrors
+    variance: np.ndarray
+
+
+def by_all_ways(ways: Sequence[Way], parameters: int) -> tuple[np.ndarray, CommonErrors]:
+    """What errors of several ways add to the covariance of so many parameters, and how these go
+    with each error by all its ways."""
+    if not ways:
+        return np.zeros(2 * (parameters,)), CommonErrors.none(parameters)
+    of, at = np.unique(np.concatenate([way.errors.of for way in ways]), return_inverse=True)
+    each = np.split(at, np.cumsum([len(way.variance) for way in ways])[:-1])
+    by, variance = np.zeros((len(of), parameters)), np.zeros(len(of))
+    for k, way in zip(each, ways, strict=True):
+        by[k] += way.errors.by
+        variance[k] = np.maximum(variance[k], way.variance)
+    often = np.bincount(at)[:, None] > 1
+    shared = by.T @ np.where(often, variance[:, None] * by, 0.0)
+    for k, way in zip(each, ways, strict=True):
+        shared -= way.errors.by.T @ np.where(often[k], variance[k, None] * way.errors.by, 0.0)
+    return shared, CommonErrors(of, by)
+
+
+def _in_common(estimate: Estimate, covariance: np.ndarray) -> tuple[np.ndarray, CommonErrors]:
+    """What errors that runs have in common add to an estimate's covariance, and how it goes with
+    each; from the covariance (U, Q) of all unknowns with its parameters."""
+    ways = _of_mesh(estimate, covariance)
+    for block, _, rows in of_graph(estimate.graph, estimate.linear.layout, estimate.values):
+        ways += _of_block(block, rows.along(covariance).A)
+    return by_all_ways(ways, covariance.shape[1])
+
+
+def _of_mesh(estimate: Estimate, covariance: np.ndarray) -> list[Way]:
+    """Parts of meshes.
+
+    Args:
+        estimate: the solution.
+        covariance: (U, Q) of all unknowns with the parameters. What an estimate is off by goes with
+            a part's true error as it goes with what is left of that, the other way.
+    """
+    found, problem = [], estimate.problem
+    for name, cells in problem.cells.items():
+        if cells.of_mesh:
+            mesh = problem.sources[cells.room].reference.digest
+            of = [f"{mesh} {cells.column} {cells.axis} {part}" for part in cells.parts.tolist()]
+            variance = np.square(problem.variables[name].sigma)
+            rows = covariance[estimate.linear.layout.columns([name])]
+            found.append(Way(CommonErrors(np.array(of), -rows / variance[:, None]), variance))
+    return found
+
+
+def _of_block(block: Block | None, rows: np.ndarray) -> list[Way]:
+    """What rows of the graph bring, here times the covariance (m, Q): a target the errors of what
+    was measured of it, an earlier run all that its estimate goes with."""
+    if isinstance(block, JointPrior) and (errors := block.off_by(rows)) is not None:
+        return [Way(errors, np.zeros(len(errors.of)))]
+    if not isinstance(block, HangingTarget):
+        return []
+    pairs = zip(TARGET_PARTS, block.measured_m, strict=True)
+    of = [f"{part} {numbers.tobytes().hex()} {axis}" for part, numbers in pairs for axis in "xyz"]
+    by = -np.c_[np.sqrt(block.weights) / block.sigmas_m] * rows
+    return [Way(CommonErrors(np.array(of), by), np.square(block.sigmas_m))]
 
 
 def in_cad(problem: Problem) -> frozenset[str]:

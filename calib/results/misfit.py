@@ -120,13 +120,12 @@ def target_rows(estimate: Estimate) -> InstrumentRows | None:
     out = _Gathered()
     for block, by, right in estimate.graph.linear_rows(estimate.values):
         if id(block) in whose:
-            weight = np.ones(len(TARGET_PARTS)) if block.weight is None else block.weight
-            root = np.repeat(np.sqrt(np.where(weight > 0, weight, np.inf)), 3)  # a part left out: 0
+            weight = block.weights
+            root = np.sqrt(np.where(weight > 0, weight, np.inf))  # a part left out: 0
             (seen,), right = estimate.variances([by]), right / root
             left = np.where(np.isfinite(root), 1.0 - seen / np.square(root), 0.0)
             each = [(*whose[id(block)], part, axis) for part in TARGET_PARTS for axis in XYZ]
-            marker, sphere = block.sigma_marker_m, block.sigma_sphere_m
-            out.add(each, ["m"] * 9, np.repeat([marker, marker, sphere], 3), -right, left)
+            out.add(each, ["m"] * block.rows, block.sigmas_m, -right, left)
     return out.rows(("recording", "target", "part", "axis"))
 
 

@@ -15,6 +15,7 @@ from calib.forward import Term, named
 from calib.problem import Problem
 from calib.problem.bodies import GRAVITY
 from calib.problem.model import Source
+from calib.problem.prior import CommonErrors
 from calib.problem.spread import names_of
 from calib.problem.unknowns import POSE_UNITS, Key, Role
 from calib.residuals.levels import down
@@ -87,6 +88,7 @@ class Solution:
         keys: (P,) calibration parameters.
         covariance: (P, P) joint covariance, m and rad; see `calib.results.intervals`.
         graph: (P, P) the same as the graph has it; None where that is no other.
+        common: how they go with errors that another run may share; None where that is not known.
     """
 
     shared: Part
@@ -95,6 +97,7 @@ class Solution:
     keys: tuple[Key, ...]
     covariance: np.ndarray
     graph: np.ndarray | None = None
+    common: CommonErrors | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,12 +143,10 @@ def solution_of(
         known: the intervals of its variables, and of shapes; as the graph has them where None.
         earlier: spreads that an earlier run knew, as of `JointPrior`.
     """
-    told = graph = estimate.covariance
-    if known is not None:
-        mine = known.of([v.name for v in estimate.variables])
-        told, graph = mine.covariance, mine.graph
-    start = np.cumsum([0] + [v.dim for v in estimate.variables])
-    at = {v.name: slice(a, a + v.dim) for v, a in zip(estimate.variables, start, strict=False)}
+    mine = known and known.of([v.name for v in estimate.variables])
+    told = mine.covariance if mine else estimate.covariance
+    ends = np.cumsum([v.dim for v in estimate.variables]).tolist()
+    at = {v.name: slice(b - v.dim, b) for v, b in zip(estimate.variables, ends, strict=True)}
     shared, recordings, scatter = Part(), {}, spreads(estimate, earlier)
     for source, terms in zip(problem.sources, problem.terms, strict=True):
         rig = source.rig
@@ -185,7 +186,8 @@ def solution_of(
         not_estimated=untold + _absent(problem),
         keys=tuple(key for v in estimate.variables for key in v.keys),
         covariance=told,
-        graph=graph,
+        graph=mine.graph if mine else told,
+        common=mine and mine.common,
     )
 
 

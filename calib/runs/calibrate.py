@@ -22,7 +22,7 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
-from calib.recalibration.prior import earlier
+from calib.recalibration.prior import earlier, starting_from
 from calib.recalibration.refit import solve_from
 from calib.recalibration.twice import all_once, refuse_given_twice
 from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
@@ -111,6 +111,7 @@ def calibrate(
         choices = _Choices(Path(out), hold_out, folds, prior)
         if choices.before:
             choices.before.refuse_unconverged(force=None)
+            model = starting_from(model, choices.before.solution, sources)
         contents = [digests(s.recording.folder) for s in sources]
         document = _model_document(sources, model, choices, contents)
         data = choices.data(sources, contents)
@@ -262,7 +263,7 @@ def _fit(
     solution = solution_of(problem, estimate, known, held.spreads if held else {})
     arrays = {"covariance": solution.covariance, "graph": solution.graph}
     arrays |= {"names": np.array(solution.names), "rests_on": np.array(data, "S64")}
-    np.savez(folder / COVARIANCE, **arrays)
+    np.savez(folder / COVARIANCE, **arrays, **solution.common.arrays)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": odd(estimate)}

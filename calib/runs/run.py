@@ -16,6 +16,7 @@ import numpy as np
 
 from calib import outputs
 from calib.effects import Trust, trusted
+from calib.problem.prior import CommonErrors
 from calib.results.solution import (
     EffectEstimate,
     FrameEstimate,
@@ -316,6 +317,7 @@ def read_solution(folder: Path) -> Solution:
             keys=tuple(keys[name] for name in names.tolist()),
             covariance=covariance,
             graph=graph,
+            common=CommonErrors.read(stored),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(

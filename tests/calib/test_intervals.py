@@ -16,6 +16,7 @@ from calib import problem as problems
 from calib.linear.cluster_sums import ClusterSums
 from calib.linear.clusters import CellSums, ClusteredRows, Gradients
 from calib.problem.model import Model, Source
+from calib.problem.prior import CommonErrors
 from calib.results.intervals import ROOM_PARTS, Intervals, intervals
 from calib.simulation import Spec
 from calib.solve.clustered import BeamsAlong
@@ -137,6 +138,8 @@ def known(wider):
         paper=graph @ np.diag([1.0, 1.0, 0.0]) @ graph,
         given=graph @ graph,
         wider=np.array(wider),
+        shared=np.zeros((3, 3)),
+        common=CommonErrors.none(3),
     )
 
 

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 
 from calib.effects import find
 from calib.problem.model import Model, default_effects
-from calib.problem.prior import JointPrior
+from calib.problem.prior import CommonErrors, JointPrior
 from calib.problem.unknowns import Unknown, pose_unknown
 from calib.recalibration import refit
 from calib.recalibration.letgo import let_go
@@ -55,6 +55,8 @@ def as_the_graph_has_them(estimate, _):
         paper=np.zeros_like(C),
         given=np.zeros_like(C),
         wider=np.ones(len(C)),
+        shared=np.zeros_like(C),
+        common=CommonErrors.none(len(C)),
     )
 
 
