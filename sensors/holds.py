@@ -10,6 +10,8 @@ Read = Callable[[Sequence[str]], Iterator[Columns]]
 
 OUTLYING_MADS = 4 * 1.4826
 """Four standard deviations, from the median absolute deviation of a normal distribution."""
+SET_ASIDE = "set_aside"
+"""The column that says how many returns of a direction are left out of its average."""
 FLOOR_M = 0.012
 """Three range steps of the coarsest sensor: below this nothing is an outlier."""
 
@@ -41,13 +43,13 @@ def average_hold(read: Read, names: Sequence[str]) -> Columns:
     keys, sweeps = _directions(read)
     median_m, limit_m = _bounds(read, keys, sweeps)
     means = [name for name in names if name not in ("ring", "column", "scan")]
-    sums: Columns = {name: np.zeros(len(keys)) for name in (*means, "n", "d", "dd", "set_aside")}
+    sums: Columns = {name: np.zeros(len(keys)) for name in (*means, "n", "d", "dd", SET_ASIDE)}
     for batch in read([*means, "ring", "column"]):
         range_m, seen = _ranges(batch)
         i = np.searchsorted(keys, _key(batch))
         d = range_m - median_m[i]
         kept = seen & (np.abs(d) <= limit_m[i])
-        _add(sums["set_aside"], i[seen & ~kept], 1.0)
+        _add(sums[SET_ASIDE], i[seen & ~kept], 1.0)
         i, d = i[kept], d[kept]
         for name, values in (("n", 1.0), ("d", d), ("dd", d * d)):
             _add(sums[name], i, values)
@@ -122,5 +124,5 @@ def _means(sums: Columns, keys: NDArray, means: Sequence[str]) -> Columns:
     columns["range_std_m"] = np.sqrt(
         np.divide(spread, n - 1, where=n > 1, out=np.full_like(n, np.nan))
     )
-    columns["set_aside"] = sums["set_aside"][has]
+    columns[SET_ASIDE] = sums[SET_ASIDE][has]
     return columns

@@ -356,7 +356,7 @@ def _check_scan(path: Path, columns: Columns, rings: int | None) -> Scan:
     xyz = np.stack([columns.pop(axis) for axis in "xyz"], axis=-1).astype(np.float64)
     range_m = np.linalg.norm(xyz, axis=-1)
     seen = np.isfinite(range_m) & (range_m > 0)
-    _check_ranges(path, range_m[seen])
+    check_ranges(path, range_m[seen])
     ring, column = (columns.pop(name)[seen].astype(np.int64) for name in ("ring", "column"))
     wrong = ring[(ring < 0) | (ring >= (rings or np.inf))]
     if wrong.size:
@@ -390,11 +390,10 @@ def _check_spread(path: Path, spread_m: Array) -> None:
         )
 
 
-def _check_ranges(path: Path, range_m: Array) -> None:
+def check_ranges(path: Path, range_m: Array) -> None:
+    """Refuse ranges (N,) of returns that no LiDAR has, in metres; InputError."""
     if not range_m.size:
         raise InputError(f"{path} has no returns; remove the file if the stop was not scanned")
     if np.median(range_m) > _FARTHEST_M:
-        raise InputError(
-            f"{path}: half of the points are beyond {np.median(range_m):.0f} m, which looks like"
-            " millimetres; x, y and z are in metres"
-        )
+        far = f"half of the points are beyond {np.median(range_m):.0f} m"
+        raise InputError(f"{path}: {far}, which looks like millimetres; x, y and z are in metres")

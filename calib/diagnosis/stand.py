@@ -15,6 +15,7 @@ from calib.blunders.judged import Blunder, judge
 from calib.blunders.others import Others
 from calib.blunders.unjudged import unjudged
 from calib.diagnosis.candidates import finer, known_effects
+from calib.diagnosis.carried import Carried
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.chance.agreeing import agreements
 from calib.diagnosis.chance.beams import BeamScatter
@@ -23,7 +24,7 @@ from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, beams_looked_at, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
-from calib.diagnosis.structure import covariates, of_look, singly, structure
+from calib.diagnosis.structure import of_look, singly, structure
 from calib.effects import CATALOGUE, Effect, Scatter, Site
 from calib.linear.layout import Layout
 from calib.problem import Problem
@@ -32,18 +33,13 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out
 from calib.residuals.groups import Group
 from calib.residuals.levels import Level
-from calib.residuals.scan import ScanStop
 from calib.residuals.tracker import TrackedBody
 from calib.results.intervals import Intervals, intervals
 from calib.results.sigmas import TOLERATED
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains.errors import InputError
-from sensors.holds import spread_known
 
-SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
-# Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
-BEAMS_DRAWN = 16_384
 REFINING_BEAMS = 4_096  # of a scan, to find between which shapes the best is: a choice
 
 
@@ -137,12 +133,12 @@ class Stand:
 
     def look(self, progress: Progress) -> Look:
         """Test everything that the model lacks."""
-        columns, sample = self.columns
-        known = known_effects(self.model, self.sources, columns, self.catalogue)
+        carried = self.carried
+        known = known_effects(self.model, self.sources, carried.everywhere, self.catalogue)
         by_rows = [e for e in known if e.by_chance and e.site is not Site.BEAM]
         known = [e for e in known if e not in by_rows]
         there = set(self.model.names)
-        unnamed = [e for e in structure(self.sources, sample) if e.name not in there]
+        unnamed = [e for e in structure(self.sources, carried.sample) if e.name not in there]
         linear, at, of_rigs = self.linearise((*known, *unnamed), progress)
         scores = project(linear, linear.candidates, self.spent)
         chance = [e for e in known if e.by_chance]
@@ -164,7 +160,6 @@ class Stand:
             noise=noise,
             values=values,
             by_rows=by_rows,
-            columns=columns,
         )
 
     def linearise(
@@ -210,34 +205,9 @@ class Stand:
         return intervals(estimate), estimate
 
     @cached_property
-    def columns(self) -> tuple[frozenset[str], dict[str, np.ndarray]]:
-        """Which columns there are, and the values of covariates at some of the points."""
-        columns = {c for s in self.sources for c in s.columns}
-        scans = self.estimate.scans
-        chosen = np.unique(np.linspace(0, len(scans) - 1, SCANS_SAMPLED).round().astype(int))
-        found: dict[str, list[np.ndarray]] = {}
-        rng = np.random.default_rng(0)
-        for i in chosen.tolist() if scans else ():
-            rows = scans[i].rows(self.estimate.values, self.estimate.associations[i])
-            columns |= set(rows.view.columns)
-            scan, _ = scans[i].store.read(scans[i].index)
-            if spread_known(scan.range_std_m, scan.count).any():
-                columns.add("range_std_m")
-            own = _own_columns(scans[i])
-            looked_at = {*covariates(), *own}
-            some = np.flatnonzero(rows.usable)
-            if len(some) > BEAMS_DRAWN:
-                some = np.sort(rng.choice(some, BEAMS_DRAWN, replace=False))
-            for name in (n for n in rows.view.columns if n in looked_at):
-                whole = np.broadcast_to(rows.view[name], rows.view.rows)
-                found.setdefault(name, []).append(whole[some])
-        return frozenset(columns), {n: np.concatenate(parts) for n, parts in found.items()}
-
-
-def _own_columns(scan: ScanStop) -> tuple[str, ...]:
-    """Columns that the maker of a scan's recording added, as the first of its scans has them."""
-    first = int(np.flatnonzero(scan.recording.has_scan)[0])
-    return (*scan.recording.covariates, *scan.store.read(first)[0].extra)
+    def carried(self) -> Carried:
+        """Which columns points and stops carry."""
+        return Carried.of(self.sources, self.estimate)
 
 
 @dataclass(frozen=True)
@@ -252,7 +222,6 @@ class Look:
         noise: effects on the scatter, tested; they move no mean.
         values: effects whose values are drawn anew by chance, tested.
         by_rows: those that need no columns of their own: what groups of rows are off tells of them.
-        columns: what points and stops carry.
     """
 
     stand: Stand
@@ -262,7 +231,6 @@ class Look:
     noise: Screen
     values: Sequence[Chance]
     by_rows: Sequence[Scatter]
-    columns: frozenset[str]
 
     def thinned(self) -> Look:
         """What is asked of a look that a search has left behind: what its tests said, and what its

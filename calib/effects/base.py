@@ -88,7 +88,7 @@ class View:
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.columns:
             known = ", ".join(sorted(self.columns))
-            said = f"column '{name}' is not in this recording, which has {known}."
+            said = f"column '{name}' is not in {self.rig.folder}, which has {known}."
             raise NoColumnError(said, name)
         column = self.columns[name]
         return column() if callable(column) else column

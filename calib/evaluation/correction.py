@@ -26,6 +26,7 @@ from chains import remote
 from chains.errors import InputError
 from sensors.documents import nearest
 from sensors.lidar import Beams, beams
+from sensors.recording import check_ranges
 
 Columns = dict[str, np.ndarray]
 KnownOfBeams = Callable[
@@ -135,6 +136,8 @@ def correct(
     _check_rings(correction.rig, path, columns, seen)
     numbers = {n: c for n, c in columns.items() if c.ndim == 1 and c.dtype.kind in "fiu"}
     ray = beams(xyz_m[seen], correction.rig.lidar.beam_origin_m)
+    if len(seen):
+        check_ranges(path, ray.range_m)
     told = known(ray)
     there = {n: c[seen] for n, c in numbers.items()} | told
     if "ring" in there:  # some formats hold it as a float

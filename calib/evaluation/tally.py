@@ -59,7 +59,8 @@ class Tally:
 
     def __init__(self, raw: bool = False) -> None:
         self.prefix = "raw_" if raw else ""
-        self._whole = np.zeros(6)
+        self._whole, self._within = np.zeros((2, 6))
+        self._directions_beyond = 0
         self._nearest = np.zeros(6)
         self._by: dict[str, np.ndarray] = {name: np.zeros((0, 6)) for name in BIN_WIDTHS}
         self._errors = np.zeros(2 * round(REACH_M / STEP_M))
@@ -75,7 +76,10 @@ class Tally:
         )
         count, spread_m = points["count"].astype(float), points["precision_m"].astype(float)
         sums = _sums(count, error_m, accuracy_m, spread_m)
+        near = np.abs(error_m) < REACH_M
         self._whole += sums.sum(axis=0)
+        self._within += sums[near].sum(axis=0)
+        self._directions_beyond += int((~near).sum())
         for name, (column, width, scale) in BIN_WIDTHS.items():
             at = np.floor(points[column].astype(float) * (scale / width)).astype(int)
             self._by[name] = _added(self._by[name], _by_bin(at, sums))
@@ -95,6 +99,8 @@ class Tally:
         }
         return {
             "whole": self._whole.tolist(),
+            "within": self._within.tolist(),
+            "directions_beyond": self._directions_beyond,
             "nearest": self._nearest.tolist(),
             "by": {name: table.tolist() for name, table in self._by.items()},
             "errors": self._errors.tolist(),
@@ -105,6 +111,8 @@ class Tally:
     def include(self, sums: Mapping[str, Any]) -> None:
         """Add what another's `sums` told."""
         self._whole += sums["whole"]
+        self._within += sums["within"]
+        self._directions_beyond += sums["directions_beyond"]
         self._nearest += sums["nearest"]
         self._errors += sums["errors"]
         self._spreads += sums["spreads"]
@@ -155,6 +163,7 @@ class Tally:
                 "std": whole["std_mm"],
                 "median": 1e3 * (middle_m - REACH_M),
                 "half_68": 1e3 * (high_m - low_m) / 2,
+                "far": self._far(),
             },
             "accuracy_mm": whole["accuracy_mm"],
             "precision_mm": whole["precision_mm"],
@@ -165,6 +174,20 @@ class Tally:
                 "precision_mm": _counts(self._spreads, 0.0),
             },
             "planes": self._thickness(labels),
+        }
+
+    def _far(self) -> dict[str, Any] | None:
+        """What lies beyond the histogram, which a few returns that a mesh does not explain may make
+        mean and standard deviation of all; None where nothing does."""
+        if not self._directions_beyond:
+            return None
+        rest = _row(self._within) if self._within[0] else {"mean_mm": None, "std_mm": None}
+        return {
+            "beyond_mm": 1e3 * REACH_M,
+            "directions": self._directions_beyond,
+            "returns": round(self._whole[0] - self._within[0]),
+            "mean_without_mm": rest["mean_mm"],
+            "std_without_mm": rest["std_mm"],
         }
 
     def _rows(self, name: str, labels: Mapping[int, str]) -> list[dict[str, Any]]:

@@ -145,7 +145,7 @@ def import_files(
             write_columns(folder / "targets.csv", rods)
         checked = check(folder, progress, graph=len(columns["stop"]) <= MOST_CHECKED)
         if checked.problems:
-            raise InputError(checked.problems[0])
+            raise InputError(". ".join([checked.problems[0].rstrip("."), *more]))
     return Imported(out, understood, odd, replace(checked, folder=out))
 
 

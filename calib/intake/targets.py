@@ -9,14 +9,15 @@ import numpy as np
 from sensors.readers.base import Array, Columns, Spheres, Track
 
 _PARTS = ("upper", "lower")
-_MARKS = ".:_ -"
+_MARKS = ".:_ -/"
 
 
 def join(spheres: Spheres | None, tracks: Sequence[Track]) -> tuple[Columns | None, list[str]]:
     """The columns of targets.csv, or None, and what is missing for it.
 
     A rod's markers are tracked points named after their target: ``T1.upper`` and ``T1.lower``,
-    or with a colon, a blank or the like. The median over the log is taken; targets hang still.
+    or with a colon, a blank, a slash or the like. The median over the log is taken; targets hang
+    still.
     """
     rods: dict[str, dict[str, Array]] = {}
     for track in tracks:
@@ -59,5 +60,5 @@ def _rod(track: Track) -> tuple[str, str]:
         for part in _PARTS:
             name = track.name[: -len(part)]
             if track.name.lower().endswith(part) and name and name[-1] in _MARKS:
-                return name.rstrip(_MARKS), part
+                return name.strip(_MARKS), part
     return track.name, ""

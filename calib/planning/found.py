@@ -128,7 +128,7 @@ def _lacking(scene: PlanningScene, poses: Poses | None) -> dict[str, tuple[Effec
     """Family -> one effect of each that moves a mean and that the stops can show, and the one unit
     of its parameters; of those that have a shape the middle one."""
     stand, rig = scene.stand, scene.source.rig
-    columns, sources = stand.columns[0], stand.sources
+    columns, sources = stand.carried.everywhere, stand.sources
     if not scene.source.recording.stops:  # as planned stops have them
         problem, values, met = scene.together(poses)
         seen = [s.rows(values, m).view for s, m in zip(problem.scans[:1], met, strict=False)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.rig.suspect import Suspect, listed
-from sensors.holds import spread_known
+from sensors.holds import SET_ASIDE, spread_known
 from sensors.lidar import LARGEST_REFLECTANCE, LidarModel, beams
 from sensors.recording import RecordedStops, Scan
 from sensors.rings import RingFinding, odd_rings, ring_elevations
@@ -138,7 +138,8 @@ def of_scans(scans: ScanSums) -> Iterator[tuple[str, str]]:
         unit = next((words for full, words in FULL_SCALES.items() if largest <= full), "")
         yield "intensity", f"up to {largest:.3g}{unit}"
     if scans.columns:
-        yield "per-point covariates", ", ".join(scans.columns)
+        names = (f"{n} (made by averaging)" if n == SET_ASIDE else n for n in scans.columns)
+        yield "per-point covariates", ", ".join(names)
 
 
 def odd_scans(rig: Rig, recording: RecordedStops, scans: ScanSums) -> Iterator[str | Suspect]:

@@ -33,11 +33,16 @@ def print_evaluations(evaluations: Mapping[str, Mapping[str, Any]]) -> None:
     console.print(table)
 
 
+def _near_std(signed: Mapping[str, Any]) -> float | None:
+    return signed["far"]["std_without_mm"] if signed["far"] else signed["std"]
+
+
 _LINES = {
     "returns": lambda e: f"{e['returns']}",
     "range against the surface, mean": lambda e: mm(e["signed_error_mm"]["mean"], "+"),
     "std": lambda e: mm(e["signed_error_mm"]["std"]),
-    "half of the central 68 %": lambda e: mm(e["signed_error_mm"]["half_68"]),
+    "std of those within 200 mm": lambda e: mm(_near_std(e["signed_error_mm"])),
+    "half of the central 68 % of directions": lambda e: mm(e["signed_error_mm"]["half_68"]),
     "mean size": lambda e: mm(e["accuracy_mm"]),
     "precision": lambda e: mm(e["precision_mm"]),
     "cloud to mesh, mean": lambda e: mm(e["cloud_to_mesh_mm"]["mean"], "+"),
@@ -80,6 +85,11 @@ def print_evaluation(evaluation: Mapping[str, Any]) -> None:
         *(mm(signed["mean"], "+"), mm(signed["std"])),
         *(mm(evaluation["accuracy_mm"]), mm(evaluation["precision_mm"])),
     )
+    if far := signed["far"]:
+        table.add_row(
+            f"without {far['returns']} beyond {far['beyond_mm']:.0f} mm",
+            *(mm(far["mean_without_mm"], "+"), mm(far["std_without_mm"]), "", ""),
+        )
     table.add_row("cloud to mesh", mm(nearest["mean"], "+"), mm(nearest["std"]), "", "")
     table.add_row()
     console.print(table)

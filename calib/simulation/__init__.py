@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -52,25 +53,29 @@ def simulate(
         InputError: the spec, the seed or an effect's name is wrong, or `out` is something else.
     """
     may_run = trusted(trust) if isinstance(spec, str) else None
-    inputs = [spec] if isinstance(spec, str) else []
+    inputs, named = ([spec], spec) if isinstance(spec, str) else ([], "the specification")
     spec = load_spec(spec) if isinstance(spec, str) else spec
     if seed < 0:
         raise InputError(f"seed {seed} is negative; give 0 or more")
     with outputs.folder(out, outputs.SIMULATED, inputs, beside=("truth.json",)) as folder:
-        rig, room = _on_paper(spec, folder, seed)
+        rig, room = _on_paper(spec, folder, seed, named)
         truth = draw(rig, spec, dict(hide or {}), seed, may_run)
         _record(truth, spec, room, folder, seed, progress or (lambda what, done, total: None))
 
 
-def _on_paper(spec: Spec, folder: Path, seed: int) -> tuple[Rig, Room]:
-    """Write what is known before anything is measured."""
+def _on_paper(spec: Spec, folder: Path, seed: int, named: str) -> tuple[Rig, Room]:
+    """Write what is known before anything is measured; the specification's name is for messages."""
     room = build(spec.room, spec.mesh_error_m, stream(_world(spec, seed), "room"))
     if spec.mesh:
         write_reference(folder / "reference", room.measured)
     if spec.arm:
         (folder / "arm.urdf").write_text(rig_on_paper.urdf(), encoding="utf-8")
-    write_yaml(folder / "rig.yaml", rig_on_paper.document(spec))
-    return load_rig(folder), room
+    write_yaml(path := folder / "rig.yaml", rig_on_paper.document(spec))
+    try:
+        return load_rig(folder), room
+    except InputError as error:
+        said = re.sub(rf"{re.escape(str(path))}(:\d+)?: ", "", str(error))
+        raise InputError(f"{named}: {said}") from None
 
 
 def _world(spec: Spec, seed: int) -> int:

@@ -32,7 +32,7 @@ NAMES = ("naive F with BIC", "stop-clustered", "leave-location-out", "LASSO")
 def answers(look: Look) -> dict[str, list[str]]:
     """Baseline -> families that it would add, in its order."""
     scores, stand = look.named.scores, look.stand
-    known = known_effects(stand.model, stand.sources, look.columns)
+    known = known_effects(stand.model, stand.sources, stand.carried.everywhere)
     at = {e: np.r_[scores.at[e.name]] for e in known if e.name in scores.at}
     at = {e: columns for e, columns in at.items() if score_test(scores, columns).dof}
     rows = sum(len(a.part) for a in stand.estimate.associations)

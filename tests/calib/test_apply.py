@@ -211,6 +211,7 @@ def test_what_a_bare_cloud_does_not_tell_is_said(fitted, tmp_path):
     [
         (lambda t: t.pop("y"), "column y is missing; a cloud has x, y and z in m"),
         (lambda t: t.update(ring=t["ring"] + 1), "ring 1 to 64, but hesai_pandarqt64 has 0 to 63"),
+        (lambda t: t.update({a: 1e3 * t[a] for a in "xyz"}), "looks like millimetres; x, y and z"),
     ],
 )
 def test_a_cloud_that_is_none_is_refused(fitted, tmp_path, change, said):

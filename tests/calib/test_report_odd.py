@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from calib.problem.model import Model
-from calib.report import report
+from calib.report import plot, report
+from calib.report.evidence import Evidence
 from calib.runs.calibrate import calibrate
 from calib.simulation import Spec, simulate
 
@@ -63,3 +64,14 @@ def test_odd_rigs_have_a_page(tmp_path, name, has, lacks):
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "nan" not in re.findall(r">([^<]*\bnan\b[^<]*)<", text)
     assert all(f"<code>{absent.id}</code>" in text for absent in written.contents.absent)
+
+
+def test_a_ladder_without_any_error_has_a_page(tmp_path):
+    """One body that a tracker sees is where it was seen, and no axis by powers begins at 0."""
+    spec = Spec(lidar=None, mesh=False, targets=0, arm=False, locations=2, stops_per_location=2)
+    simulate(spec, tmp_path / "rec", seed=2)
+    run = calibrate(tmp_path / "rec", tmp_path / "run")
+    assert run.summary["rms_mm"]["fit"] < 1e-9 < run.summary["rms_mm"]["noise_floor"]
+    chart = plot(Evidence.of([run]), "ladder", tmp_path / "ladder.svg")
+    assert chart.id == "ladder" and (tmp_path / "ladder.svg").stat().st_size > 1000
+    assert "ladder" in {each.id for each in report([run], tmp_path / "page.html").contents.charts}

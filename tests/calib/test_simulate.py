@@ -1,9 +1,12 @@
 """The simulator, against rays and chains computed here: geometry, noise, files."""
 
+import re
+
 import numpy as np
 import pytest
 
 from calib.problem.model import Source
+from calib.results.check import check
 from calib.simulation import PRESETS, Spec, load_spec, simulate
 from chains.errors import InputError
 from sensors.recording import read_table
@@ -109,6 +112,8 @@ def test_raw_sweeps_are_quantised_and_average_to_the_same(tmp_path):
     source, truth = made(tmp_path / "rec", changed(EXACT, noise=1, raw=True, sweeps=30))
     raw = read_table(source.recording.folder / "scans" / "L00P00.parquet")
     assert set(np.unique(raw["scan"])) == set(range(30))
+    held = dict(check(source.recording.folder, graph=False).contents)
+    assert held["per-point covariates"] == "set_aside (made by averaging)"
     ahead = source.rig.lidar.beam_origin_m[0]
     flat = np.hypot(raw["x"], raw["y"]).astype(float)
     range_m = np.hypot(flat - ahead, raw["z"].astype(float))
@@ -238,6 +243,13 @@ def test_specs_are_read_strictly(tmp_path):
     path.write_text("tracker: null\n")
     with pytest.raises(InputError, match="targets are seen by a tracker"):
         load_spec(str(path))
+    for wrong, said in (
+        ("lidar: nope\n", r"spec\.yaml: lidar: LiDAR model nope is unknown"),
+        ("levels: [nope]\n", r"spec\.yaml: levels\.frames\.0: .*nope"),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(InputError, match=f"{re.escape(str(tmp_path))}/{said}"):
+            simulate(str(path), tmp_path / "rec")
     with pytest.raises(InputError, match="neither a YAML file nor a preset; did you mean tiny"):
         load_spec("tinny")
 

@@ -40,6 +40,19 @@ def test_the_middle_and_its_width_are_those_of_all_directions(evaluated):
     assert signed["half_68"] == pytest.approx((high - low) / 2, abs=0.3)
 
 
+def test_returns_that_are_far_off_are_counted_and_told_apart(evaluated):
+    found, points, column = evaluated
+    far, count = found["signed_error_mm"]["far"], points["count"].to_numpy()
+    beyond = points[column].abs().to_numpy() >= 0.2
+    assert beyond.sum() == far["directions"] > 0 and count[beyond].sum() == far["returns"]
+    near, n = 1e3 * points[column].to_numpy(float)[~beyond], count[~beyond]
+    assert far["mean_without_mm"] == pytest.approx(np.average(near, weights=n), abs=1e-3)
+    spread = 1e3 * np.nan_to_num(points["precision_m"].to_numpy(float)[~beyond])
+    squares = n * near**2 + (n - 1) * spread**2
+    std = np.sqrt(squares.sum() / n.sum() - far["mean_without_mm"] ** 2)
+    assert far["std_without_mm"] == pytest.approx(std, rel=1e-3)
+
+
 def test_histograms_are_numpy_s(evaluated):
     found, points, column = evaluated
     histogram = found["histograms"]["signed_error_mm"]

@@ -291,7 +291,7 @@ def _numbered(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _axes(stand: Stand) -> list[CellAxis]:
     """The covariates of points and stops that change, cut into cells and bins."""
     scans = stand.estimate.scans
-    _, sample = stand.columns
+    sample = stand.carried.sample
     rings = max(scan.lidar.rings for scan in scans)
     out = [CellAxis.of("ring", np.arange(rings))]
     for name, values in sorted(sample.items()):

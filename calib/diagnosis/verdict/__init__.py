@@ -363,7 +363,7 @@ def _unexplained(candidate: Candidate, screen: Screen, taken: Sequence[str]) -> 
 
 
 def _untestable(look: Look) -> dict[str, str]:
-    found = {}
+    found, carried = {}, look.stand.carried
     there = {e.family for e in look.stand.model.effects}
     gauges = {g.family for g in look.named.gauges} - {
         c.effect.family for c in look.named.candidates
@@ -371,8 +371,9 @@ def _untestable(look: Look) -> dict[str, str]:
     for effect in look.stand.catalogue:
         if effect.family in there or not concerned(effect, look.stand.sources):
             continue
-        if missing := lacking(effect, look.stand.sources, look.columns):
-            found[effect.family] = f"the recordings lack {', '.join(missing)}"
+        if missing := lacking(effect, look.stand.sources, carried.everywhere):
+            each = (f"{m}{carried.where_not(m)}" for m in missing)
+            found[effect.family] = f"the recordings lack {', '.join(each)}"
         elif effect.family in gauges:
             found[effect.family] = ABSORBED_BY_MODEL
     return found

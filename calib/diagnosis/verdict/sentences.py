@@ -89,7 +89,7 @@ def sentences_of(
         out.append(
             f"Could not be tested on these recordings: {', '.join(gone[:MOST_LISTED])}{more}."
         )
-    return out
+    return out + look.stand.carried.sentences()
 
 
 def scatters(some: Sequence[Chance]) -> list[Chance]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from calib.report.plots import Figure
 
 STEEP = 8.0  # largest over smallest error from which a scale is logarithmic
+NO_ERROR = 1e-9  # of the largest: what rounding leaves of no error, which is on no such scale
 
 
 def error_mm(rung: Rung) -> tuple[str, float]:
@@ -73,7 +74,7 @@ def _ladder(evidence: Evidence) -> Figure:
     ax.set_yticks(range(len(rungs) + 1), ["as in CAD", *names])
     ax.set_ylim(len(rungs) + 0.5, -0.6)
     values = [rms[0]["nominal"], *shown, *floors, *(r["fit"] for r in rms)]
-    if max(values) > STEEP * min(values):
+    if max(values) > STEEP * min(values) and min(values) > NO_ERROR * max(values):
         plots.log_axis(ax, min(values), max(values))
     ax.set_xlabel(f"rms of the {evidence.run.summary['residual']} residual, mm")
     ax.margins(x=0.08)

@@ -38,7 +38,7 @@ def findings(evidence: Evidence) -> Iterator[Chart | Absent]:
         "findings",
         f"Missing: {', '.join(confirmed)}"
         if confirmed
-        else f"Of {len(candidates)} effects that were tested none is confirmed",
+        else "No effect that was tested is confirmed",
         "How much each effect would explain of what the model does not absorb, as they rank, "
         "with its p-value adjusted for multiple testing. Blue: confirmed. Many of the others "
         "explain part of the same residuals as a confirmed one.",

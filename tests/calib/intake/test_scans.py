@@ -121,14 +121,14 @@ def test_targets_are_joined_by_name():
     spheres = Spheres(("T1", "T2", "T3", "T4"), centre)
     points = [
         Track(
-            name=f"T{k}{mark}{part}",
+            name=f"{root}T{k}{mark}{part}",
             kind="point",
             clock="c",
             time_s=np.arange(3.0),
             names=POSE[:3],
             values=np.array([[k, 0, 2.0], [k, 0, 2.0], [np.nan] * 3]) - [0, 0, part == "lower"],
         )
-        for k in (1, 2, 3)
+        for k, root in ((1, ""), (2, "/"), (3, ""))  # topics of ROS begin with a slash
         for part, mark in (("upper", ":"), ("lower", " "))
     ]
     found, odd = targets.join(spheres, points)
