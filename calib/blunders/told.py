@@ -19,7 +19,7 @@ from calib.rig import Rig
 from calib.rig.suspect import listed
 from sensors.rings import RingFinding
 
-SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}
+SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "1": ("", 1.0)}
 LARGE_SIZE = 1000.0  # mm or mrad, from which on metres and radians are read more easily
 # Where an angle of an arm is not as drawn: a choice, ten times what arms are off by at most.
 DRAWN_OTHERWISE_RAD = 0.5
@@ -96,11 +96,15 @@ def document(left: LeftOut, sources: Sequence[Source]) -> dict[str, Any]:
     }
 
 
-def of_rings(lidar: str, found: RingFinding) -> dict[str, Any]:
-    """Rings with wrong numbers, in the same form. As sigma, how far off the best numbers leave
-    elevations."""
+def of_rings(source: Source, found: RingFinding, sources: Sequence[Source]) -> dict[str, Any]:
+    """Rings of a recording with wrong numbers, in the same form; of several, it is named. As sigma,
+    how far off the best numbers leave elevations."""
+    each = zip(labels(sources), sources, strict=True)
+    label = next((label for label, s in each if s is source), "") if len(sources) > 1 else ""
+    said = f"{label}: {found.sentence}." if label else whole(found.sentence)
     return {
-        **otherwise("rings", lidar, "rings", whole(found.sentence)),
+        **otherwise("rings", source.rig.lidar.name, "rings", said),
+        "recording": label or None,
         "size": found.off_rad,
         "unit": "rad",
         "sigma": found.left_rad,
@@ -338,7 +342,7 @@ def size_told(size: float, sigma: float, unit: str) -> str:
         in_deg = f" ({np.degrees(size):.3g} deg)" if unit == "rad" else ""
         return f"{size:.3g} {unit}{in_deg}"
     known = f" ± {scale * sigma:.2g}" if np.isfinite(sigma) else ""
-    return f"{scale * size:.3g}{known} {name}"
+    return f"{scale * size:.3g}{known} {name}".rstrip()
 
 
 def _wrong_sign(left: LeftOut, rig: Rig) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -41,7 +41,11 @@ class _Alone(NamedTuple):
 
 
 def contradictions(
-    stand: Stand, found: Search, converged: bool, progress: Progress
+    stand: Stand,
+    found: Search,
+    converged: bool,
+    progress: Progress,
+    rings: Sequence[Mapping[str, Any]] = (),
 ) -> list[dict[str, Any]]:
     """What everything else that stands out may follow from, as blunders of `diagnosis.json`:
     targets that are mixed up, where a fit has not converged, or else what recordings contradict
@@ -52,10 +56,15 @@ def contradictions(
         found: what a search of it found.
         converged: whether that fit has an optimum.
         progress: as of `calib.solve.fit.solve`.
+        rings: those of recordings that have wrong numbers, as blunders: what each ring has of its
+            own differs for that there.
     """
     mixed = [] if converged else list(mixed_targets(stand.sources))
     calm = converged and not (found.found or found.unnamed or found.blunders or found.chance)
-    return mixed or list(moved_between(stand, found.looks[-1].stand, calm, progress))
+    moved = mixed or list(moved_between(stand, found.looks[-1].stand, calm, progress))
+    where = {each["recording"] for each in rings}
+    by_ring = {effect.name for effect in stand.model.effects if "ring" in effect.covariates}
+    return [each for each in moved if each["recording"] not in where or each["name"] not in by_ring]
 
 
 def moved_between(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -33,6 +33,18 @@ def harmful(what: str) -> bool:
     """Whether offsets by ring are of no use; where rings are counted from the other end, as many
     drivers do, they are right, and only a table by the LiDAR's own channels has another order."""
     return what != REVERSED
+
+
+def misnumbered(sources: Sequence[Source]) -> Iterator[tuple[Source, RingFinding]]:
+    """Recordings of a fit whose rings are numbered so that offsets by ring are of no use: as by
+    `harmful`, or otherwise than in another recording of the same rig."""
+    found = {id(source): each for source, each in odd_rings(sources)}
+    numbered = {id(s): found[id(s)].what if id(s) in found else "" for s in sources}
+    for source in (s for s in sources if id(s) in found):
+        scanned = (s for s in sources if s.rig.name == source.rig.name)
+        alike = {numbered[id(s)] for s in scanned if s.recording.has_scan.any()}
+        if harmful(found[id(source)].what) or len(alike) > 1:
+            yield source, found[id(source)]
 
 
 def detectable(sources: Iterable[Source]) -> dict[str, dict[str, float]]:

@@ -36,7 +36,7 @@ from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_pose
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.observability import not_heard, seen_alone, shown_by_no_other
 from calib.results.outstanding import moves
-from calib.results.rings import detectable, harmful, odd_rings
+from calib.results.rings import detectable, misnumbered
 from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
@@ -80,7 +80,7 @@ def diagnose(
 
 def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
-    rings = ((s.rig.lidar.name, each) for s, each in odd_rings(stand.sources))
+    rings = [told.of_rings(*each, stand.sources) for each in misnumbered(stand.sources)]
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
     # rejected for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
@@ -89,11 +89,11 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
-    if between := contradictions(stand, found, run.converged, progress):
+    if between := contradictions(stand, found, run.converged, progress, rings):
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
         found, suspect = replace(_of_one_rig(found), **kept), []
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
-    if between:
+    if between or (rings and len(stand.sources) > 1):
         found, formulas = _of_one_rig(found), Unnamed()
     result = conclude(
         found,
@@ -103,7 +103,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         rejected,
         forbids(run),
         [
-            *(told.of_rings(lidar, each) for lidar, each in rings if harmful(each.what)),
+            *rings,
             *_not_as_drawn(run, found),
             *(told.of_scan(s, shown_by_no_other([s])) for s in seen_alone(stand.estimate)),
             *_rooms(stand),

@@ -7,8 +7,10 @@ import numpy as np
 import pandas
 import pytest
 
+from calib.blunders.told import of_rings, size_told
 from calib.exporters import export
-from calib.problem.model import Model
+from calib.problem.model import Model, Source
+from calib.results.rings import misnumbered
 from calib.runs.calibrate import calibrate
 from calib.runs.run import Run
 from calib.show.verdict import judge
@@ -90,3 +92,21 @@ def test_the_verdict_is_amber_or_red_as_it_matters(runs):
     assert told("straight") == ("amber", [])  # as it is not diagnosed
     assert told("reversed")[0] == "amber" and "the other end" in told("reversed")[1][0]
     assert told("one off")[0] == "red" and "1 too high" in told("one off")[1][0]
+
+
+def test_recordings_of_one_rig_that_are_numbered_alike_are_left_as_they_are(runs):
+    """Counted from the other end, offsets by ring are right; but not in one recording of two."""
+    straight, other, off = (Source.open(runs[name].recordings[0]) for name in NUMBERED)
+    assert [*misnumbered([straight]), *misnumbered([other]), *misnumbered([other, other])] == []
+    ((source, finding),) = misnumbered([straight, other])
+    assert source is other
+    told = of_rings(source, finding, [straight, other])
+    assert told["recording"] == "reversed" and told["sentence"].startswith("reversed: rings of")
+    ((source, finding),) = misnumbered([off])
+    told = of_rings(source, finding, [off])
+    assert told["recording"] is None and told["sentence"].startswith("Rings of")
+
+
+def test_a_size_without_a_unit_has_none():
+    assert size_told(0.00195, 0.00011, "1") == "0.00195 ± 0.00011"
+    assert size_told(0.00195, 0.00011, "m") == "1.95 ± 0.11 mm"
