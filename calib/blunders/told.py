@@ -96,15 +96,13 @@ def document(left: LeftOut, sources: Sequence[Source]) -> dict[str, Any]:
     }
 
 
-def of_rings(source: Source, found: RingFinding, sources: Sequence[Source]) -> dict[str, Any]:
-    """Rings of a recording with wrong numbers, in the same form; of several, it is named. As sigma,
-    how far off the best numbers leave elevations."""
-    each = zip(labels(sources), sources, strict=True)
-    label = next((label for label, s in each if s is source), "") if len(sources) > 1 else ""
-    said = f"{label}: {found.sentence}." if label else whole(found.sentence)
+def of_rings(lidar: str, recording: str, found: RingFinding) -> dict[str, Any]:
+    """Rings with wrong numbers, in the same form; of several recordings, this one is named. As
+    sigma, how far off the best numbers leave elevations."""
+    said = f"{recording}: {found.sentence}." if recording else whole(found.sentence)
     return {
-        **otherwise("rings", source.rig.lidar.name, "rings", said),
-        "recording": label or None,
+        **otherwise("rings", lidar, "rings", said),
+        "recording": recording or None,
         "size": found.off_rad,
         "unit": "rad",
         "sigma": found.left_rad,
@@ -338,7 +336,7 @@ def suspect(left: LeftOut) -> str:
 def size_told(size: float, sigma: float, unit: str) -> str:
     """A size in m or rad and its sigma, as people read it."""
     name, scale = SHOWN.get(unit, (unit, 1.0))
-    if scale * size >= LARGE_SIZE:
+    if name and scale * size >= LARGE_SIZE:
         in_deg = f" ({np.degrees(size):.3g} deg)" if unit == "rad" else ""
         return f"{size:.3g} {unit}{in_deg}"
     known = f" ± {scale * sigma:.2g}" if np.isfinite(sigma) else ""

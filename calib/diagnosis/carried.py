@@ -19,8 +19,8 @@ SCANS_SAMPLED = 8  # scans from which the bins of covariates are taken
 # Beams of each of them at most: a quantile of so many beams in all is off by 0.15 % of them.
 BEAMS_DRAWN = 16_384
 SPREAD_OF_HOLDS, LABELS = "range_std_m", "label"
-# What comes of an instrument, and not of a file: who lacks it has no rows that look at it.
-NO_FILE_HAS = frozenset({"tracked", "mesh_box_m", "up", SPREAD_OF_HOLDS})
+# What a recording may lack: it has then no rows that look at it, or effects do without it.
+NOT_DEMANDED = frozenset({"tracked", "mesh_box_m", "up", SPREAD_OF_HOLDS})
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Carried:
     @cached_property
     def partly(self) -> dict[str, list[str]]:
         """Column that some recordings carry and others do not -> these."""
-        some = sorted(self.anywhere - NO_FILE_HAS - frozenset.intersection(*self.of_each.values()))
+        some = sorted(self.anywhere - NOT_DEMANDED - frozenset.intersection(*self.of_each.values()))
         return {c: [n for n, mine in self.of_each.items() if c not in mine] for c in some}
 
     def where_not(self, column: str) -> str:
@@ -94,12 +94,13 @@ class Carried:
             if column in self.recorded:
                 by.setdefault(listed(names), []).append(column)
         out = [
-            f"{names} lacks {listed(columns)}, which other recordings have: nothing over "
-            f"{'it' if len(columns) == 1 else 'them'} was tested."
+            f"No effect that depends on {listed(columns)} was tested: {names} "
+            f"{'have' if ', ' in names else 'has'} none."
             for names, columns in by.items()
         ]
         if names := self.partly.get(LABELS):
-            out.append(f"{listed(names)} has no mesh: nothing over labels of surfaces was tested.")
+            have = "have" if len(names) > 1 else "has"
+            out.append(f"No effect of labels was tested: {listed(names)} {have} no mesh.")
         return out
 
     @cached_property

@@ -166,7 +166,7 @@ def _locked(work: Path, path: Path) -> int:
                     f"{path} is being written by {who}; wait for it, or give another -o"
                 )
     if not work.exists():
-        raise InputError(f"{path} cannot be made: {work.parent} takes no folder")
+        raise InputError(f"{path} cannot be made: no folder can be made in {work.parent}")
     raise InputError(f"{path} is being written by other processes; try again")
 
 

@@ -14,20 +14,20 @@ from calib.forward import Derivatives, Values
 from calib.problem.unknowns import Unknown
 from chains import se3
 
-COMMON_OF, COMMON_BY = "common_of", "common_by"  # names of arrays in a file
+COMMON_NAMES, COMMON_BY = "common_names", "common_by"  # names of arrays in a file
 
 
 class CommonErrors(NamedTuple):
-    """How an estimate goes with errors that another run may share, as it rests on the same mesh, or
-    on the same scan of the spheres: each is the same in both, so what they make does not average
-    out.
+    """How an estimate goes with errors of what was measured once, and may be measured once for
+    another run, too: a mesh, or the scan of a sphere. Each is the same in both.
 
     Args:
-        of: (M,) what errs: a part of a mesh, or an axis of a sphere, by what was measured.
-        by: (M, P) by how much each parameter is off for a unit of each, in their units.
+        names: (M,) what errs, told apart by what was measured: a part of a mesh, or a coordinate of
+            a sphere or a marker.
+        by: (M, P) by how much each parameter is off for one sigma of each, in its unit.
     """
 
-    of: np.ndarray
+    names: np.ndarray
     by: np.ndarray
 
     @classmethod
@@ -36,20 +36,48 @@ class CommonErrors(NamedTuple):
         return cls(np.zeros(0, "U1"), np.zeros((0, parameters)))
 
     @classmethod
-    def read(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
-        """From the arrays of a file; None where an earlier version wrote it."""
-        if not {COMMON_OF, COMMON_BY} <= arrays.keys():
+    def read(cls, arrays: Mapping[str, np.ndarray], parameters: int) -> Self | None:
+        """From the arrays of a file that has so many parameters; None where an earlier version
+        wrote it.
+
+        Raises:
+            ValueError: they do not fit each other.
+        """
+        if not {COMMON_NAMES, COMMON_BY} <= arrays.keys():
             return None
-        return cls(np.char.decode(arrays[COMMON_OF]), arrays[COMMON_BY].astype(float))
+        names, by = arrays[COMMON_NAMES], arrays[COMMON_BY]
+        if names.dtype.kind != "S" or by.dtype.kind != "f" or by.shape != (len(names), parameters):
+            raise ValueError(f"{COMMON_NAMES} and {COMMON_BY} do not fit each other")
+        return cls(np.char.decode(names), by.astype(float))
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """As a file has them."""
-        return {COMMON_OF: np.char.encode(self.of), COMMON_BY: self.by.astype(np.float32)}
+        """As a file has them; float32, as a millionth of an error tells enough."""
+        return {COMMON_NAMES: np.char.encode(self.names), COMMON_BY: self.by.astype(np.float32)}
 
     def at(self, parameters: np.ndarray) -> CommonErrors:
         """The same of some of the parameters (n,)."""
         return self._replace(by=self.by[:, parameters])
+
+    @staticmethod
+    def together(some: Sequence[CommonErrors], parameters: int) -> tuple[np.ndarray, CommonErrors]:
+        """Of errors that reach an estimate in several ways, by the rows of each: what that adds to
+        its covariance (P, P), and how it goes with each of them by all ways.
+
+        With a_i by how much it is off for one sigma of an error by way i, ``(sum_i a_i) (sum_i
+        a_i)^T - sum_i a_i a_i^T``: what a covariance lacks that takes them for different errors.
+        """
+        some = [each for each in some if len(each.names)]
+        if not some:
+            return np.zeros(2 * (parameters,)), CommonErrors.none(parameters)
+        names, at = np.unique(np.concatenate([each.names for each in some]), return_inverse=True)
+        ends = np.cumsum([len(each.names) for each in some])[:-1]
+        by, alone = np.zeros((len(names), parameters)), np.zeros(2 * (parameters,))
+        several = np.bincount(at) > 1
+        for k, each in zip(np.split(at, ends), some, strict=True):
+            by[k] += each.by
+            alone += each.by[several[k]].T @ each.by[several[k]]
+        return by[several].T @ by[several] - alone, CommonErrors(names, by)
 
 
 @dataclass(frozen=True)
@@ -65,7 +93,8 @@ class JointPrior:
             count them again, see `Problem.resting_on`.
         spreads: key of a spread, as of `calib.problem.spread` -> what it was then, and the sigma of
             that: a few stops tell little of how widely stops scatter.
-        common: how the means go with errors that the newer data may share.
+        common: how the means go with errors that the newer data may share; None where the earlier
+            run did not write that down.
     """
 
     held: Sequence[Unknown]
@@ -117,15 +146,16 @@ class JointPrior:
         covariance = self.covariance + np.diag(np.square(np.concatenate(moved)))
         return replace(self, covariance=covariance, freed=self.freed | freed.keys())
 
-    def off_by(self, rows: np.ndarray) -> CommonErrors | None:
+    def off_by(self, rows: np.ndarray) -> CommonErrors:
         """How an estimate from this prior goes with the errors that its means go with.
 
         Args:
             rows: (P, Q) the rows of the prior, times the covariance of the Q parameters of that
                 estimate.
         """
-        by = self.common and self.common.by @ self._root.T @ rows
-        return self.common and self.common._replace(by=by)
+        if self.common is None:
+            return CommonErrors.none(rows.shape[1])
+        return self.common._replace(by=self.common.by @ self._root.T @ rows)
 
     @cached_property
     def _root(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ def contradictions(
     found: Search,
     converged: bool,
     progress: Progress,
-    rings: Sequence[Mapping[str, Any]] = (),
+    numbered: Collection[str] = (),
 ) -> list[dict[str, Any]]:
     """What everything else that stands out may follow from, as blunders of `diagnosis.json`:
     targets that are mixed up, where a fit has not converged, or else what recordings contradict
@@ -56,19 +56,17 @@ def contradictions(
         found: what a search of it found.
         converged: whether that fit has an optimum.
         progress: as of `calib.solve.fit.solve`.
-        rings: those of recordings that have wrong numbers, as blunders: what each ring has of its
-            own differs for that there.
+        numbered: recordings, by their labels, whose rings have other numbers than those of others:
+            what each ring has of its own differs for that.
     """
     mixed = [] if converged else list(mixed_targets(stand.sources))
     calm = converged and not (found.found or found.unnamed or found.blunders or found.chance)
-    moved = mixed or list(moved_between(stand, found.looks[-1].stand, calm, progress))
-    where = {each["recording"] for each in rings}
-    by_ring = {effect.name for effect in stand.model.effects if "ring" in effect.covariates}
-    return [each for each in moved if each["recording"] not in where or each["name"] not in by_ring]
+    moved = moved_between(stand, found.looks[-1].stand, calm, progress, numbered)
+    return mixed or list(moved)
 
 
 def moved_between(
-    stand: Stand, last: Stand, calm: bool, progress: Progress
+    stand: Stand, last: Stand, calm: bool, progress: Progress, numbered: Collection[str] = ()
 ) -> Iterator[dict[str, Any]]:
     """The links that moved between the first recording of a rig and a later one, as blunders of
     `diagnosis.json`: as a fit of the later one, with that of the first as its prior, finds them.
@@ -82,9 +80,12 @@ def moved_between(
             that moved once seems to.
         calm: whether the fit to all has an optimum, and nothing was found that it lacks.
         progress: as of `calib.solve.fit.solve`.
+        numbered: as of `contradictions`.
     """
     chance = {e.name for e in last.model.effects if e.by_chance} - set(stand.model.names)
     model = replace(last.model.minus(list(chance)), moved={})
+    by_ring = {effect.name for effect in model.effects if "ring" in effect.covariates}
+    of_day = {effect.name for effect in model.effects if effect.goes_with_time}
     named = dict(zip(labels(last.sources), last.sources, strict=True))
     of_rigs: dict[str, list[str]] = {}
     for label, source in named.items():
@@ -106,7 +107,10 @@ def moved_between(
             continue
         for label in (each for each in mine if each not in (first, *bad)):
             for link in _since(alone[first], model, named[label], alarm, progress):
-                yield _told(stand, first, label, link, FIT_EACH)
+                if link.name in by_ring and not {first, label}.isdisjoint(numbered):
+                    continue
+                told = _told(stand, first, label, link, FIT_EACH)
+                yield told if link.name not in of_day else _of_one_day(told, first)
         if before is not None:
             common = _shared(stand, before, first)
             for link in _since(firsts[before], model, named[first], alarm, progress, common):
@@ -165,6 +169,22 @@ def _told(stand: Stand, first: str, later: str, link: Link, remedy: str) -> dict
         "p_adjusted": at_least(link.p_value),
         "indistinguishable_from": instead,
     }
+
+
+def _of_one_day(told: Mapping[str, Any], first: str) -> dict[str, Any]:
+    """The same of what goes with time, and so with one recording's: in a fit of several it has one
+    time for all, and so neither its time nor its size.
+
+    Args:
+        told: as of `_told`, with the name that it has in that fit.
+        first: what the first recording is called.
+    """
+    name, later = told["name"], told["recording"]
+    said = (
+        f"{name} is of {later} alone, or has another size there than in {first}, and one fit takes "
+        f"it for the same; {FIT_APART}, which tells its time and size"
+    )
+    return {**told, "sentence": whole(said)} | dict.fromkeys(("size", "unit", "sigma", "axis"))
 
 
 def _alone(model: Model, source: Source, progress: Progress) -> _Alone:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -71,6 +72,18 @@ def starting_from(model: Model, solution: Solution, sources: Iterable[Source]) -
         T = known[name].T_parent_child
         out[name] = (*T[:3, 3].tolist(), *se3.to_quat_wxyz(T).tolist())
     return replace(model, starts=out)
+
+
+def untold(prior: JointPrior, run: Path | str) -> list[str]:
+    """That a prior, of this run, does not say which errors it may share with newer recordings; a
+    clause, or none."""
+    if prior.common is not None:
+        return []
+    return [
+        f"--prior {run}, or a run before it, was made by an earlier version, which did not write "
+        "down how its estimate goes with errors of the mesh and of spheres; they count as if they "
+        "were other errors in these recordings, until that run is fitted again"
+    ]
 
 
 def _earlier_spreads(

@@ -31,6 +31,9 @@ def solve_from(
     """Estimate with an earlier solution as prior, letting go link by link of what has moved; the
     same with its shapes among the unknowns, the intervals of that, and what became of each link;
     see `let_go` and `shapes_freed`.
+
+    The tests of links take errors of the prior and of the newer rows for independent. Errors of a
+    mesh that both share move the two alike, so changes are smaller than these tests have it.
     """
     found: list[_Fit] = []
     first: list[_Fit] = []  # of the prior as it is, with which `let_go` begins, and may end
@@ -47,7 +50,7 @@ def solve_from(
         known = intervals(freed, progress)
         seen = errors_at(estimate.problem, estimate.values)
         wide = widened(known, estimate, seen, prior.variables)
-        held, at_least = (each.of(prior.variables).apart for each in (known, wide))
+        held, at_least = (each.of(prior.variables).without_repeated for each in (known, wide))
         moved, turned = change(prior, estimate.values)
         covariances = (held.graph, held.covariance, at_least.covariance)
         graph, covariance, widest = (turned @ each @ turned.T for each in covariances)

@@ -24,13 +24,14 @@ where rows err alone, 0.97 to 0.99.
 Of a ring half or more of whose beams are rejected the others may agree by chance: its interval is
 that from before the fit.
 
-Errors of the mesh, and of spheres as they were scanned, are the same in all runs that rest on them.
-They reach an estimate whose prior is an earlier run by two ways, by what that run said and by the
+Errors of a mesh, and of spheres as they were scanned, are the same in all runs that rest on them.
+They reach an estimate whose prior is an earlier run in two ways, by what that run said and by the
 newer rows; and so does a sphere that was scanned once, and tracked anew for each of two recordings
-of one fit. The graph takes them for different errors. With s_i how the estimate goes with an error
-by way i, and d the variance of the error, what it leaves out is ``d (sum_i s_i) (sum_i s_i)^T - d
-sum_i s_i s_i^T``. That is added. The estimate itself stays that of the graph (the consider
-covariance: Schmidt 1966; Tapley, Schutz and Born 2004, Statistical Orbit Determination, ch. 6).
+of one fit. The graph takes them for different errors, so what they make together is added; see
+`CommonErrors.together`. The estimate itself stays that of the graph (a consider covariance:
+Schmidt 1966; Tapley, Schutz and Born 2004, Statistical Orbit Determination, ch. 6). Of errors of
+rows that are `least` times larger than stated, the part that they share with the earlier run is,
+too. Where the two ways work against each other, no interval gets narrower than by C.
 
 Estimates are reported with a sigma: half the 95 % interval (t quantile) divided by 1.96.
 """
@@ -40,7 +41,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,7 +51,6 @@ from calib.linear.own import own_rows
 from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import CommonErrors, JointPrior
-from calib.problem.problem import Block
 from calib.problem.unknowns import Role
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
@@ -81,7 +80,7 @@ class Intervals:
         least: how many times larger than their sigmas the errors of rows are, at least 1: all but
             what is due to `given` is so much wider.
         cad: how many times wider than stated values of CAD scatter, at least 1.
-        shared: (Q, Q) what errors add that reach the estimate by several ways; 0 where none does.
+        repeated: (Q, Q) what errors add that reach the estimate in several ways; 0 where none does.
         common: how it goes with errors that another run may share.
     """
 
@@ -92,16 +91,15 @@ class Intervals:
     paper: np.ndarray
     given: np.ndarray
     wider: np.ndarray
-    shared: np.ndarray
+    repeated: np.ndarray
     common: CommonErrors
     least: float = 1.0
     cad: float = 1.0
 
     @property
-    def apart(self) -> Intervals:
-        """The same, as if each way by which an error reaches the estimate had an error of its own:
-        the covariance that the graph's weights have."""
-        return replace(self, shared=np.zeros_like(self.shared))
+    def without_repeated(self) -> Intervals:
+        """The same, as if in each way in which an error reaches the estimate it were another."""
+        return replace(self, repeated=np.zeros_like(self.repeated))
 
     @property
     def covariance(self) -> np.ndarray:
@@ -115,7 +113,14 @@ class Intervals:
             np.where(share > ROUNDED_SHARE, more / np.maximum(share, ROUNDED_SHARE), 0.0)
         )
         wider = np.outer(root, root) * self.data + (self.cad**2 - 1.0) * self.paper
-        return least + wider + self.shared
+        return self._with_repeated(least + wider)
+
+    def _with_repeated(self, covariance: np.ndarray) -> np.ndarray:
+        if not self.repeated.any():
+            return covariance
+        whole = covariance + self.least * self.repeated
+        short = np.sqrt(np.maximum(np.diag(self.graph) / np.diag(whole), 1.0))
+        return np.outer(short, short) * whole
 
     def of(self, names: Sequence[str]) -> Intervals:
         """Those of some of the unknowns, in the order given."""
@@ -130,7 +135,7 @@ class Intervals:
             data=self.data[np.ix_(some, some)],
             paper=self.paper[np.ix_(some, some)],
             given=self.given[np.ix_(some, some)],
-            shared=self.shared[np.ix_(some, some)],
+            repeated=self.repeated[np.ix_(some, some)],
             common=self.common.at(some),
             wider=self.wider[some],
         )
@@ -183,7 +188,7 @@ class Intervals:
         share = np.diag(some.data) / np.diag(some.graph)
         factor = 1.0 + (np.square(some.wider) - 1.0) @ share / max(share @ share, ROUNDED_SHARE)
         more = max(factor - least, 0.0) * some.data + (self.cad**2 - 1.0) * some.paper
-        more += least * some.graph - (least - 1.0) * some.given
+        more += least * some.graph - (least - 1.0) * some.given + self.least * some.repeated
         found[np.ix_(held, held)] += more - some.covariance
         return found
 
@@ -253,7 +258,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     for name, lost in estimate.not_trusted.items():
         at = np.searchsorted(layout.kept, layout.columns([name])[lost])
         wider[at] = np.maximum(wider[at], before[name][lost] / sigma[at])
-    shared, common = _in_common(estimate, directions * sigma)
+    repeated, common = _in_common(estimate, directions * sigma)
     return Intervals(
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),
@@ -262,76 +267,50 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
         paper=paper * np.outer(sigma, sigma),
         given=given * np.outer(sigma, sigma),
         wider=wider,
-        shared=shared,
+        repeated=repeated,
         common=common,
     )
 
 
-class Way(NamedTuple):
-    """A way by which errors of these variances (M,) reach an estimate; where the variance is that
-    of another way, 0."""
-
-    errors: CommonErrors
-    variance: np.ndarray
-
-
-def by_all_ways(ways: Sequence[Way], parameters: int) -> tuple[np.ndarray, CommonErrors]:
-    """What errors of several ways add to the covariance of so many parameters, and how these go
-    with each error by all its ways."""
-    if not ways:
-        return np.zeros(2 * (parameters,)), CommonErrors.none(parameters)
-    of, at = np.unique(np.concatenate([way.errors.of for way in ways]), return_inverse=True)
-    each = np.split(at, np.cumsum([len(way.variance) for way in ways])[:-1])
-    by, variance = np.zeros((len(of), parameters)), np.zeros(len(of))
-    for k, way in zip(each, ways, strict=True):
-        by[k] += way.errors.by
-        variance[k] = np.maximum(variance[k], way.variance)
-    often = np.bincount(at)[:, None] > 1
-    shared = by.T @ np.where(often, variance[:, None] * by, 0.0)
-    for k, way in zip(each, ways, strict=True):
-        shared -= way.errors.by.T @ np.where(often[k], variance[k, None] * way.errors.by, 0.0)
-    return shared, CommonErrors(of, by)
-
-
 def _in_common(estimate: Estimate, covariance: np.ndarray) -> tuple[np.ndarray, CommonErrors]:
-    """What errors that runs have in common add to an estimate's covariance, and how it goes with
-    each; from the covariance (U, Q) of all unknowns with its parameters."""
+    """What errors that reach an estimate in several ways add to its covariance (Q, Q), and how it
+    goes with all that other runs may share; from the covariance (U, Q) of all unknowns with its
+    parameters."""
     ways = _of_mesh(estimate, covariance)
     for block, _, rows in of_graph(estimate.graph, estimate.linear.layout, estimate.values):
-        ways += _of_block(block, rows.along(covariance).A)
-    return by_all_ways(ways, covariance.shape[1])
+        if isinstance(block, JointPrior):
+            ways.append(block.off_by(rows.along(covariance).A))
+        elif isinstance(block, HangingTarget):
+            ways.append(_of_target(block, rows.along(covariance).A))
+    return CommonErrors.together(ways, covariance.shape[1])
 
 
-def _of_mesh(estimate: Estimate, covariance: np.ndarray) -> list[Way]:
-    """Parts of meshes.
+def _of_mesh(estimate: Estimate, covariance: np.ndarray) -> list[CommonErrors]:
+    """Parts of meshes, by their kind. What an estimate is off by goes with the true error of a part
+    as it goes with what is left of that, the other way.
 
     Args:
         estimate: the solution.
-        covariance: (U, Q) of all unknowns with the parameters. What an estimate is off by goes with
-            a part's true error as it goes with what is left of that, the other way.
+        covariance: (U, Q) of all unknowns with the parameters.
     """
     found, problem = [], estimate.problem
-    for name, cells in problem.cells.items():
+    for unknown, cells in problem.cells.items():
         if cells.of_mesh:
-            mesh = problem.sources[cells.room].reference.digest
-            of = [f"{mesh} {cells.column} {cells.axis} {part}" for part in cells.parts.tolist()]
-            variance = np.square(problem.variables[name].sigma)
-            rows = covariance[estimate.linear.layout.columns([name])]
-            found.append(Way(CommonErrors(np.array(of), -rows / variance[:, None]), variance))
+            width_m = problem.meetings[cells.room].patches_m.get(cells.column, 0.0)
+            mesh = f"{problem.sources[cells.room].reference.digest} {cells.column} {width_m:.4f}"
+            names = [f"{mesh} {cells.axis} {part}" for part in cells.parts.tolist()]
+            rows = covariance[estimate.linear.layout.columns([unknown])]
+            sigma = problem.variables[unknown].sigma
+            found.append(CommonErrors(np.array(names), -rows / sigma[:, None]))
     return found
 
 
-def _of_block(block: Block | None, rows: np.ndarray) -> list[Way]:
-    """What rows of the graph bring, here times the covariance (m, Q): a target the errors of what
-    was measured of it, an earlier run all that its estimate goes with."""
-    if isinstance(block, JointPrior) and (errors := block.off_by(rows)) is not None:
-        return [Way(errors, np.zeros(len(errors.of)))]
-    if not isinstance(block, HangingTarget):
-        return []
-    pairs = zip(TARGET_PARTS, block.measured_m, strict=True)
-    of = [f"{part} {numbers.tobytes().hex()} {axis}" for part, numbers in pairs for axis in "xyz"]
-    by = -np.c_[np.sqrt(block.weights) / block.sigmas_m] * rows
-    return [Way(CommonErrors(np.array(of), by), np.square(block.sigmas_m))]
+def _of_target(block: HangingTarget, rows: np.ndarray) -> CommonErrors:
+    """What was measured of a target; from its rows, times the covariance (9, Q)."""
+    parts = zip(TARGET_PARTS, block.measured_m, strict=True)
+    each = [f"{part} {numbers.tobytes().hex()}" for part, numbers in parts]
+    names = [f"{part} {axis}" for part in each for axis in "xyz"]
+    return CommonErrors(np.array(names), -np.sqrt(block.weights)[:, None] * rows)
 
 
 def in_cad(problem: Problem) -> frozenset[str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from calib.problem.model import Source
+from calib.problem.model import Source, labels
 from calib.rig.scanned import ScanSums, numbering
 from sensors.rings import REVERSED, RingFinding, least_off_rad
 
@@ -35,16 +35,36 @@ def harmful(what: str) -> bool:
     return what != REVERSED
 
 
-def misnumbered(sources: Sequence[Source]) -> Iterator[tuple[Source, RingFinding]]:
-    """Recordings of a fit whose rings are numbered so that offsets by ring are of no use: as by
-    `harmful`, or otherwise than in another recording of the same rig."""
+class Misnumbered(NamedTuple):
+    """A recording of a fit whose rings are numbered so that offsets by ring are of no use there.
+
+    Args:
+        source: it.
+        label: what it is called beside others; empty where it is the only one.
+        finding: how they are numbered.
+        apart: whether another recording of the same rig has them otherwise.
+    """
+
+    source: Source
+    label: str
+    finding: RingFinding
+    apart: bool
+
+
+def misnumbered(sources: Sequence[Source]) -> list[Misnumbered]:
+    """Those recordings of a fit: as by `harmful`, or as another of the same rig is numbered
+    otherwise."""
     found = {id(source): each for source, each in odd_rings(sources)}
-    numbered = {id(s): found[id(s)].what if id(s) in found else "" for s in sources}
-    for source in (s for s in sources if id(s) in found):
-        scanned = (s for s in sources if s.rig.name == source.rig.name)
-        alike = {numbered[id(s)] for s in scanned if s.recording.has_scan.any()}
-        if harmful(found[id(source)].what) or len(alike) > 1:
-            yield source, found[id(source)]
+    how = {id(s): found[id(s)].what if id(s) in found else "" for s in sources}
+    out = []
+    for source, label in zip(sources, labels(sources), strict=True):
+        if finding := found.get(id(source)):
+            same = [s for s in sources if s.rig.name == source.rig.name]
+            apart = len({how[id(s)] for s in same if s.recording.has_scan.any()}) > 1
+            if harmful(finding.what) or apart:
+                name = label if len(sources) > 1 else ""
+                out.append(Misnumbered(source, name, finding, apart))
+    return out
 
 
 def detectable(sources: Iterable[Source]) -> dict[str, dict[str, float]]:

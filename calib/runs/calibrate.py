@@ -22,7 +22,7 @@ from calib.problem import Problem
 from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
-from calib.recalibration.prior import earlier, starting_from
+from calib.recalibration.prior import earlier, starting_from, untold
 from calib.recalibration.refit import solve_from
 from calib.recalibration.twice import all_once, refuse_given_twice
 from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
@@ -68,7 +68,7 @@ from calib.runs.run import (
     versions,
     write_state,
 )
-from calib.runs.stored import RUN_FORMAT
+from calib.runs.stored import RUN_FORMAT, write_covariance
 from calib.solve.estimate import Estimate, Start
 from calib.solve.fit import Progress, shapes_freed, solve
 from chains import remote
@@ -107,11 +107,11 @@ def calibrate(
         refuse_given_twice([r.resolve() for r in recordings])
         model = model or Model.of(None, (), (), recordings, known=effects_of_prior(prior))
         opened = [Source.open(r).of_beams(model.beams) for r in recordings]
-        sources, model = placed(leave_out(opened, model.without), model)
         choices = _Choices(Path(out), hold_out, folds, prior)
         if choices.before:
             choices.before.refuse_unconverged(force=None)
-            model = starting_from(model, choices.before.solution, sources)
+            model = starting_from(model, choices.before.solution, opened)
+        sources, model = placed(leave_out(opened, model.without), model)
         contents = [digests(s.recording.folder) for s in sources]
         document = _model_document(sources, model, choices, contents)
         data = choices.data(sources, contents)
@@ -261,12 +261,11 @@ def _fit(
     known = widened(known, estimate, seen, elsewhere)
     calibration = known.of([v.name for v in estimate.variables])
     solution = solution_of(problem, estimate, known, held.spreads if held else {})
-    arrays = {"covariance": solution.covariance, "graph": solution.graph}
-    arrays |= {"names": np.array(solution.names), "rests_on": np.array(data, "S64")}
-    np.savez(folder / COVARIANCE, **arrays, **solution.common.arrays)
+    write_covariance(folder / COVARIANCE, solution, data, held)
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
-    summary = _summary(problem, estimate, nominal, seen, unseen) | {"odd": odd(estimate)}
+    summary = _summary(problem, estimate, nominal, seen, unseen)
+    summary["odd"] = [*odd(estimate), *(untold(held, choices.prior) if held else ())]
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
         summary |= since(links, before.summary)

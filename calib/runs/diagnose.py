@@ -80,7 +80,8 @@ def diagnose(
 
 def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosis:
     """As `diagnose`, and nothing is written."""
-    rings = [told.of_rings(*each, stand.sources) for each in misnumbered(stand.sources)]
+    rings = misnumbered(stand.sources)
+    apart = [each.label for each in rings if each.apart]
     # Away from an optimum every effect that moves the state towards one looks missing, beams are
     # rejected for no reason of their own, and groups far out that are not to blame.
     found = search(stand, progress) if run.converged else search(stand, progress, most=0)
@@ -89,12 +90,12 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         suspect = [told.suspect(found.blunders[0])]
         found = replace(found, looks=found.looks[:1], blunders=())
     refits &= run.summary["rms_mm"]["held_out"] is not None and run.model["hold_out"] != "none"
-    if between := contradictions(stand, found, run.converged, progress, rings):
+    if between := contradictions(stand, found, run.converged, progress, apart):
         kept = {} if run.converged else {"looks": found.looks[:1], "blunders": ()}
-        found, suspect = replace(_of_one_rig(found), **kept), []
+        found, suspect = replace(_of_one_rig(found, between), **kept), []
     found, falls, formulas, rejected = _answer(run, stand, found, refits, progress)
-    if between or (rings and len(stand.sources) > 1):
-        found, formulas = _of_one_rig(found), Unnamed()
+    if between or apart:
+        found, formulas = _of_one_rig(found, between), Unnamed()
     result = conclude(
         found,
         falls,
@@ -103,7 +104,7 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         rejected,
         forbids(run),
         [
-            *rings,
+            *(told.of_rings(r.source.rig.lidar.name, r.label, r.finding) for r in rings),
             *_not_as_drawn(run, found),
             *(told.of_scan(s, shown_by_no_other([s])) for s in seen_alone(stand.estimate)),
             *_rooms(stand),
@@ -144,11 +145,14 @@ def _rooms(stand: Stand) -> Iterator[dict[str, Any]]:
     yield from (told.of_room(r.frame, r.sentence) for r in rooms if r.is_better)
 
 
-def _of_one_rig(found: Search) -> Search:
-    """A search where something moved between two recordings: that seems to scatter, and has
-    structure over whatever differs between the two, as a day's temperature does. What is there
-    besides, fits of each recording alone tell."""
-    return replace(found, chance=(), unnamed=(), at_first=())
+def _of_one_rig(found: Search, between: Sequence[Mapping[str, Any]]) -> Search:
+    """A search where something moved `between` two recordings, or their rings have other numbers:
+    that seems to scatter, and has structure over whatever differs between the two, as a day's
+    temperature does. What is there besides, fits of each recording alone tell; so they do of an
+    effect that is one recording's."""
+    told = {each["name"] for each in between}
+    named = [step for step in found.found if step.effect.name not in told]
+    return replace(found, found=named, chance=(), unnamed=(), at_first=())
 
 
 def _answer(

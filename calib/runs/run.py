@@ -307,6 +307,10 @@ def read_solution(folder: Path) -> Solution:
     if any(x.shape != shape or x.dtype.kind != "f" for x in (covariance, graph)):
         raise InputError(f"{beside} is no covariance of a run; {FIT_AGAIN}")
     try:
+        common = CommonErrors.read(stored, len(names))
+    except ValueError as error:
+        raise InputError(f"{beside}: {error}; {FIT_AGAIN}") from None
+    try:
         shared = _read_part(data)
         recordings = {n: _read_part(p) for n, p in data.get("recordings", {}).items()}
         keys = {key.name: key for key in units_of(shared, recordings)}
@@ -317,7 +321,7 @@ def read_solution(folder: Path) -> Solution:
             keys=tuple(keys[name] for name in names.tolist()),
             covariance=covariance,
             graph=graph,
-            common=CommonErrors.read(stored),
+            common=common,
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(

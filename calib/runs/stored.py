@@ -5,12 +5,15 @@ A file may have been cut short, edited, or made by somebody else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pydantic
 
+from calib.problem.prior import JointPrior
+from calib.results.solution import Solution
 from chains.errors import InputError
 from sensors import documents, numbers
 from sensors.documents import Document, Format, Number, read_yaml, validate
@@ -131,3 +134,14 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except InputError as error:
         why = str(error)
     raise InputError(f"{why}; {FIT_AGAIN}")
+
+
+def write_covariance(
+    path: Path, solution: Solution, data: Sequence[str], prior: JointPrior | None
+) -> None:
+    """Put into a file how well all is known together, and what that rests on: `data`, and errors
+    that other runs may share, unless the prior does not tell of its own."""
+    arrays = {"covariance": solution.covariance, "graph": solution.graph}
+    arrays |= {"names": np.array(solution.names), "rests_on": np.array(data, "S64")}
+    told = prior is None or prior.common is not None
+    np.savez(path, **arrays, **(solution.common.arrays if told else {}))

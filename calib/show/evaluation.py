@@ -41,7 +41,7 @@ _LINES = {
     "returns": lambda e: f"{e['returns']}",
     "range against the surface, mean": lambda e: mm(e["signed_error_mm"]["mean"], "+"),
     "std": lambda e: mm(e["signed_error_mm"]["std"]),
-    "std of those within 200 mm": lambda e: mm(_near_std(e["signed_error_mm"])),
+    "std without those far off": lambda e: mm(_near_std(e["signed_error_mm"])),
     "half of the central 68 % of directions": lambda e: mm(e["signed_error_mm"]["half_68"]),
     "mean size": lambda e: mm(e["accuracy_mm"]),
     "precision": lambda e: mm(e["precision_mm"]),
@@ -87,7 +87,7 @@ def print_evaluation(evaluation: Mapping[str, Any]) -> None:
     )
     if far := signed["far"]:
         table.add_row(
-            f"without {far['returns']} beyond {far['beyond_mm']:.0f} mm",
+            f"without {far['returns']} returns beyond {far['beyond_mm']:.0f} mm",
             *(mm(far["mean_without_mm"], "+"), mm(far["std_without_mm"]), "", ""),
         )
     table.add_row("cloud to mesh", mm(nearest["mean"], "+"), mm(nearest["std"]), "", "")

@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 from calib.effects import find
 from calib.problem.model import Source
 from calib.problem.prior import CommonErrors, JointPrior
+from calib.problem.surfaces import SURFACE_SHARES
 from calib.problem.unknowns import vector_unknown
-from calib.results import intervals
-from calib.results.intervals import Way, by_all_ways
+from calib.results.intervals import Intervals
 from calib.runs.calibrate import calibrate, grow
 from calib.runs.reopen import model_of
 from calib.simulation import Spec, simulate
@@ -75,7 +75,9 @@ def described(folder, **sigmas):
 
 
 @pytest.mark.parametrize("way", ["one fit", "from run to run"])
-def test_a_sphere_scanned_once_counts_once_where_its_markers_are_tracked_twice(once, tmp_path, way):
+def test_a_sphere_scanned_once_counts_once_where_its_markers_are_tracked_twice(
+    once, tmp_path, way, monkeypatch
+):
     home = once(spheres)
     sphere, marker = 1e-3, 4e-4
     for name in ("first", "second"):
@@ -85,8 +87,15 @@ def test_a_sphere_scanned_once_counts_once_where_its_markers_are_tracked_twice(o
     both = [home / "first", home / "second"]
     run = fitted(both, tmp_path / "both") if way == "one fit" else chain(home, tmp_path)
     np.testing.assert_allclose(faro(run), oracle, rtol=0.02)
-    least = np.hypot(sphere, marker) / np.sqrt(2.0) / np.hypot(sphere, marker / np.sqrt(2.0))
-    assert least < 0.8  # of it, what two measurements of each sphere would leave
+    monkeypatch.setattr(CommonErrors, "together", staticmethod(alone))
+    both_twice = np.hypot(sphere, marker) / np.sqrt(2.0) / np.hypot(sphere, marker / np.sqrt(2.0))
+    blind = fitted(both, tmp_path / "b") if way == "one fit" else chain(home, tmp_path / "b")
+    np.testing.assert_allclose((faro(blind) / oracle).min(), both_twice, rtol=0.02)
+
+
+def alone(some, parameters):
+    """In place of `CommonErrors.together`: each error is another in each way."""
+    return np.zeros(2 * (parameters,)), CommonErrors.none(parameters)
 
 
 def moved_by(home, out, before):
@@ -99,12 +108,14 @@ def moved_by(home, out, before):
 
 def said_of(run, what):
     solution = run.solution
-    (k,) = np.flatnonzero(solution.common.of == what)
+    (k,) = np.flatnonzero(solution.common.names == what)
     return solution.common.by[k, [key.unknown == "faro" for key in solution.keys]]
 
 
 def test_a_chain_of_runs_goes_with_an_error_of_a_sphere_as_it_says(once, tmp_path):
-    home = once(spheres)
+    home, sigma_m = once(spheres), 1e-3
+    for name in ("first", "second"):
+        described(home / name, sigma_sphere_m=sigma_m)
     run = chain(home, tmp_path)
     with Scene(home / "first", np.random.default_rng()).sheet("targets.csv") as targets:
         at_m = targets.numbers("faro_x", "faro_y", "faro_z")[2]
@@ -114,7 +125,7 @@ def test_a_chain_of_runs_goes_with_an_error_of_a_sphere_as_it_says(once, tmp_pat
             x[2, 0] += NUDGE_M
             targets.put(x, "faro_x")
     moved = moved_by(home, tmp_path / "nudged", run)
-    said = said_of(run, f"sphere {at_m.tobytes().hex()} x")
+    said = said_of(run, f"sphere {at_m.tobytes().hex()} x") / sigma_m
     assert np.abs(said).max() > 0.05
     np.testing.assert_allclose(moved, said, atol=0.01 * np.abs(said).max())
 
@@ -122,7 +133,8 @@ def test_a_chain_of_runs_goes_with_an_error_of_a_sphere_as_it_says(once, tmp_pat
 def test_a_chain_of_runs_goes_with_an_error_of_the_mesh_as_it_says(once, tmp_path):
     home = once(room)
     run = chain(home, tmp_path)
-    mesh = Source.open(home / "first").reference
+    source = Source.open(home / "first")
+    mesh, sigma_m = source.reference, np.sqrt(SURFACE_SHARES["surface"]) * ROOM.mesh_error_m
     upright = np.abs(mesh.planes[:-1, 2]) < 0.5
     wall = int(np.argmax(np.bincount(mesh.surface, mesh.area_m2 * upright)))
     normal = mesh.planes[np.flatnonzero(mesh.surface == wall)[0], :3]
@@ -135,7 +147,7 @@ def test_a_chain_of_runs_goes_with_an_error_of_the_mesh_as_it_says(once, tmp_pat
 
         Scene(home / name, np.random.default_rng()).remesh(nudged)
     moved = moved_by(home, tmp_path / "nudged", run)
-    said = said_of(run, f"{mesh.digest} surface None {wall}")
+    said = said_of(run, f"{mesh.digest} surface 0.0000 None {wall}") / sigma_m
     assert np.abs(said).max() > 0.05
     np.testing.assert_allclose(moved, -said, atol=0.1 * np.abs(said).max())
 
@@ -146,50 +158,95 @@ def test_a_chain_of_runs_knows_no_more_of_a_room_than_one_fit_of_all(once, tmp_p
     run = chain(home, tmp_path)
     ratio = faro(run) / faro(joint)
     assert ((ratio > 0.95) & (ratio < 1.25)).all()
-    none = lambda ways, parameters: (np.zeros(2 * (parameters,)), CommonErrors.none(parameters))  # noqa: E731
-    monkeypatch.setattr(intervals, "by_all_ways", none)
+    monkeypatch.setattr(CommonErrors, "together", staticmethod(alone))
     assert (faro(chain(home, tmp_path / "blind")) / faro(joint)).min() < 0.9
 
 
-def test_all_ways_together_are_the_covariance_of_a_dense_filter():
-    """Two runs of a linear world, the second from the first, whose rows meet the same errors m: how
-    its estimate goes with all that is by chance, written out."""
+def test_ways_together_are_the_covariance_of_a_dense_filter():
+    """Three runs of a linear world, each from the one before, whose rows meet the same errors m, of
+    which each run has another opinion how large they are: how its estimate goes with all that is by
+    chance, written out."""
     rng = np.random.default_rng(2)
-    P, M, rows = 3, 4, 40
-    sigma_x, sigma_m = np.array([4.0, 5.0, 6.0]), np.array([0.5, 1.0, 2.0, 3.0])
+    P, M, rows, sigma_x = 3, 4, 40, np.array([4.0, 5.0, 6.0])
     like = rng.normal(size=(P, M))  # moves of x that rows can hardly tell from errors
     by_x, by_m, by_n, prior = -np.eye(P), np.zeros((P, M)), np.zeros((P, 0)), None
     known = np.diag(np.square(sigma_x))
-    for _ in range(2):
+    for times in (1.0, 3.0, -0.5):
         J = rng.normal(size=(rows, P))
-        A = np.hstack([J, J @ like + 0.1 * rng.normal(size=(rows, M))])
-        weight = block_diag(np.linalg.inv(known), np.diag(1.0 / np.square(sigma_m)))
+        A = np.hstack([J, times * (J @ like + 0.1 * rng.normal(size=(rows, M)))])
+        weight = block_diag(np.linalg.inv(known), np.eye(M))
         C = np.linalg.inv(A.T @ A + weight)
         of_rows, of_before = C[:P] @ A.T, C[:P] @ weight[:, :P]
-        off = of_before @ by_x, of_rows @ A[:, P:] + of_before @ by_m
-        (by_x, by_m), by_n = off, np.hstack([of_before @ by_n, of_rows])
-        errors = CommonErrors(np.array([*"klmn"]), -C[P:, :P] / np.square(sigma_m)[:, None])
-        ways = [Way(errors, np.square(sigma_m))]
+        by_x, by_m = of_before @ by_x, of_rows @ A[:, P:] + of_before @ by_m
+        by_n = np.hstack([of_before @ by_n, of_rows])
+        ways = [CommonErrors(np.array([*"klmn"]), -C[P:, :P])]
         if prior:
             _, by = prior.evaluate({"x": np.zeros(P)}, derivatives=True)
-            ways.append(Way(prior.off_by(by["x"] @ C[:P, :P]), np.zeros(M)))
-        shared, common = by_all_ways(ways, P)
-        known = C[:P, :P] + shared
-        every = np.hstack([by_x * sigma_x, by_m * sigma_m, by_n])
+            ways.append(prior.off_by(by["x"] @ C[:P, :P]))
+        repeated, common = CommonErrors.together(ways, P)
+        known = C[:P, :P] + repeated
+        every = np.hstack([by_x * sigma_x, by_m, by_n])
         np.testing.assert_allclose(common.by, by_m.T, atol=1e-9)
         np.testing.assert_allclose(known, every @ every.T, rtol=1e-9)
         held = vector_unknown("x", sigma_x, dofs="abc", units=("m",) * P)
         prior = JointPrior([held], {"x": np.zeros(P)}, known, common=common)
-    assert np.abs(shared).max() > 0.1 * known.max()
+        assert (np.abs(repeated).max() > 0.1 * known.max()) == (len(ways) > 1)
+
+
+def test_no_interval_is_narrower_than_the_graph_has_it_where_ways_work_against_each_other():
+    graph = np.diag([4.0, 1.0])
+    known = intervals(graph, repeated=np.array([[-3.0, 0.5], [0.5, 2.0]]))
+    assert np.diag(known.covariance).tolist() == [4.0, 3.0]
+    assert np.linalg.eigvalsh(known.covariance).min() > 0.0
+    assert np.diag(known.without_repeated.covariance).tolist() == [4.0, 1.0]
+
+
+def test_errors_that_are_larger_than_stated_are_so_in_what_ways_have_in_common():
+    """Two equal steps whose sigmas are a third of what errors truly are: the first was widened for
+    it in its run, the second is, and errors of both are wholly one."""
+    first, second = 9.0, 1.0  # variances of what each adds
+    a = np.sqrt(np.array([[first], [second]]))
+    repeated = (a.sum() ** 2 - first - second) * np.ones((1, 1))
+    known = intervals(np.array([[first + second]]), repeated, given=np.array([[first]]))
+    np.testing.assert_allclose(known.at_least(3.0).covariance, (3.0 + 3.0) ** 2)
+
+
+def intervals(graph, repeated, given=None):
+    none = np.zeros_like(graph)
+    return Intervals(
+        names=("x",),
+        dims=(len(graph),),
+        graph=graph,
+        data=graph,
+        paper=none,
+        given=none if given is None else given,
+        wider=np.ones(len(graph)),
+        repeated=repeated,
+        common=CommonErrors.none(len(graph)),
+    )
+
+
+def test_a_run_of_an_older_version_does_not_say_what_it_shares_nor_do_runs_after_it(once, tmp_path):
+    home = once(spheres)
+    path = fitted(home / "first", tmp_path / "run_first").folder / "covariance.npz"
+    with np.load(path) as arrays:
+        kept = {name: x for name, x in arrays.items() if not name.startswith("common")}
+    np.savez(path, **kept)
+    second = fitted(home / "second", tmp_path / "run_second", prior=path.parent)
+    assert any("earlier version" in each for each in second.summary["odd"])
+    assert second.solution.common is None
+    np.savez(path, **kept, common_names=np.array([b"a"]), common_by=np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"covariance\.npz: common_names and common_by do not fit"):
+        fitted(home / "second", tmp_path / "other", prior=path.parent)
 
 
 def test_a_file_holds_errors_in_common(tmp_path):
     common = CommonErrors(np.array(["a", "bc"]), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     np.savez(tmp_path / "a.npz", **common.arrays)
     with np.load(tmp_path / "a.npz") as arrays:
-        again = CommonErrors.read(dict(arrays))
-    assert again.of.tolist() == ["a", "bc"] and again.by.tolist() == common.by.tolist()
-    assert CommonErrors.read({"names": np.zeros(2)}) is None
+        again = CommonErrors.read(dict(arrays), 3)
+    assert again.names.tolist() == ["a", "bc"] and again.by.tolist() == common.by.tolist()
+    assert CommonErrors.read({"names": np.zeros(2)}, 3) is None
 
 
 def test_a_recording_that_nothing_ties_to_the_room_starts_where_the_earlier_run_has_it(
@@ -197,11 +254,14 @@ def test_a_recording_that_nothing_ties_to_the_room_starts_where_the_earlier_run_
 ):
     """It cannot be fitted alone. What is made of its run later finds its start there, too."""
     home = once(room)
+    first = fitted(home / "first", tmp_path / "first")
     (home / "second" / "targets.csv").unlink()
+    with Scene(home / "second", np.random.default_rng()).sheet("stops.csv") as stops:
+        for name in (n for n in stops.columns if "_markers." in n):
+            stops.columns[name][1] = ""  # where the scanner is, is asked for such stops first
     with pytest.raises(InputError, match=r"nothing ties 'faro' to 'opti'.*--prior"):
         fitted(home / "second", tmp_path / "alone")
-    first = fitted(home / "first", tmp_path / "first")
-    run = fitted(home / "second", tmp_path / "run", prior=first.folder)
+    run = calibrate(home / "second", tmp_path / "run", prior=first.folder)
     assert run.summary["converged"] and not any(link["moved"] for link in run.summary["links"])
     assert run.summary["rms_mm"]["fit"] < 1.2 * run.summary["rms_mm"]["noise_floor"]
     again = grow(run, model_of(run).plus((find("incidence_angle_bias"),)), tmp_path / "grown")

@@ -138,7 +138,7 @@ def known(wider):
         paper=graph @ np.diag([1.0, 1.0, 0.0]) @ graph,
         given=graph @ graph,
         wider=np.array(wider),
-        shared=np.zeros((3, 3)),
+        repeated=np.zeros((3, 3)),
         common=CommonErrors.none(3),
     )
 

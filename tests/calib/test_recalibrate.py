@@ -55,7 +55,7 @@ def as_the_graph_has_them(estimate, _):
         paper=np.zeros_like(C),
         given=np.zeros_like(C),
         wider=np.ones(len(C)),
-        shared=np.zeros_like(C),
+        repeated=np.zeros_like(C),
         common=CommonErrors.none(len(C)),
     )
 

@@ -12,11 +12,14 @@ from calib.exporters import export
 from calib.problem.model import Model, Source
 from calib.results.rings import misnumbered
 from calib.runs.calibrate import calibrate
+from calib.runs.diagnose import diagnose
 from calib.runs.run import Run
 from calib.show.verdict import judge
 from calib.simulation import Spec, simulate
 from chains.errors import InputError
 from sensors.recording import read_table, write_table
+
+from ..mishaps import Scene
 
 SPEC = Spec(lidar="hesai_pandarxt32", locations=2, stops_per_location=3, column_step=250)
 EFFECTS = "arm_link_length,arm_joint_offset,ring_elevation_offset,ring_range_offset"
@@ -97,16 +100,38 @@ def test_the_verdict_is_amber_or_red_as_it_matters(runs):
 def test_recordings_of_one_rig_that_are_numbered_alike_are_left_as_they_are(runs):
     """Counted from the other end, offsets by ring are right; but not in one recording of two."""
     straight, other, off = (Source.open(runs[name].recordings[0]) for name in NUMBERED)
-    assert [*misnumbered([straight]), *misnumbered([other]), *misnumbered([other, other])] == []
-    ((source, finding),) = misnumbered([straight, other])
-    assert source is other
-    told = of_rings(source, finding, [straight, other])
+    assert misnumbered([straight]) == misnumbered([other]) == misnumbered([other, other]) == []
+    for both in ([straight, other], [other, straight]):
+        (found,) = misnumbered(both)
+        assert found.source is other and found.label == "reversed" and found.apart
+    told = of_rings("xt32", found.label, found.finding)
     assert told["recording"] == "reversed" and told["sentence"].startswith("reversed: rings of")
-    ((source, finding),) = misnumbered([off])
-    told = of_rings(source, finding, [off])
+    (found,) = misnumbered([off])
+    told = of_rings("xt32", found.label, found.finding)
     assert told["recording"] is None and told["sentence"].startswith("Rings of")
+    assert not any(found.apart for found in misnumbered([off, off]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("order", [1, -1], ids=["later", "first"])
+def test_rings_that_one_recording_of_two_counts_from_the_other_end_are_what_is_wrong(
+    once, tmp_path, order
+):
+    """And neither that offsets by ring changed, nor what follows from it, whichever is given
+    first."""
+    folder = once(_three_runs)
+    scene = Scene(folder / "reversed", np.random.default_rng())
+    scene.each_scan(lambda scan: scan | {"x": scan["x"] + np.float32(1e-5)})  # no copies
+    run = calibrate(
+        [folder / "straight", folder / "reversed"][::order], tmp_path / "run", hold_out="none"
+    )
+    found = diagnose(run, refits=False)
+    assert [b["kind"] for b in found.blunders][:1] == ["rings"]
+    assert not any(b["name"] == "ring_range_offset" for b in found.blunders)
+    assert found.unexplained == [] and found.sentences[0].startswith("reversed: rings of")
 
 
 def test_a_size_without_a_unit_has_none():
     assert size_told(0.00195, 0.00011, "1") == "0.00195 ± 0.00011"
+    assert size_told(1500.0, 2.0, "1") == "1.5e+03 ± 2"
     assert size_told(0.00195, 0.00011, "m") == "1.95 ± 0.11 mm"
