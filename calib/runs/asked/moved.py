@@ -99,7 +99,10 @@ def moved(a: Run, b: Run) -> Moved:
             f"{b.folder} was fitted from another run than {a.folder}; fit its recordings from that "
             f"one: rigcal fit {recordings} -o NEW --prior {a.folder}"
         )
-    told = "Different recordings: their errors are independent, and CAD counts once"
+    told = (
+        "Different recordings: their errors are independent, those of a mesh that both have taken "
+        "for such, and CAD counts once"
+    )
     links = _documents(_apart(Pair.of(a, b), b))
     return Moved((a, b), INDEPENDENT, links, bounds=(), remarks=(told, *differ))
 
