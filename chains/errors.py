@@ -21,6 +21,10 @@ class NothingMetError(InputError):
     """No beam of a scan meets a surface."""
 
 
+class UntiedError(InputError):
+    """Nothing in a recording says where the scanner's frame is in the tracker's."""
+
+
 class NoColumnError(InputError):
     """A recording has not the column that an effect looks at."""
 

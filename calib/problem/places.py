@@ -21,7 +21,7 @@ from calib.problem.unknowns import (
 )
 from calib.residuals.groups import Group
 from chains import se3
-from chains.errors import InputError
+from chains.errors import InputError, UntiedError
 
 GUESSED_POSE = np.repeat([0.2, 0.3], 3)  # rad, m: a base_guess is set up by hand
 
@@ -138,7 +138,7 @@ class Places:
         known = self.model.starts.get(source.rig.reference_frame)
         if known is not None:
             return se3.from_xyz_quat(known[:3], known[3:])
-        raise InputError(
+        raise UntiedError(
             f"{source.recording.folder}: nothing ties '{source.rig.reference_frame}' to "
             f"'{source.rig.world}'; add targets.csv, or base_guess columns to stops.csv, or give a "
             "run that knows it as --prior."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -67,7 +68,10 @@ class _Settled(NamedTuple):
 
 
 def let_go(
-    prior: JointPrior, fit: Callable[[JointPrior], RefittedPrior], alarm: float = ALARM
+    prior: JointPrior,
+    fit: Callable[[JointPrior], RefittedPrior],
+    alarm: float = ALARM,
+    begin: Mapping[str, float] = MappingProxyType({}),
 ) -> list[Link]:
     """What became of each link since an earlier solution.
 
@@ -85,13 +89,14 @@ def let_go(
         prior: the earlier solution.
         fit: from it, or from the same where links were let go, to the newer data.
         alarm: chance that any link is called moved where none has.
+        begin: links that the first fit lets go, each by how many of its sigmas.
     """
-    limit, free = alarm / len(prior.held), {}
-    first = _where_anything_is_met(prior, fit)
+    limit, free = alarm / len(prior.held), dict(begin)
+    first = _where_anything_is_met(prior.loosened(free), fit)
     if first is None or not first.converged:
         free, first = _from_afar(prior, fit)
     elif first.not_trusted:
-        free = {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in first.not_trusted}
+        free |= {v.name: float(FREEDOMS[0]) for v in prior.held if v.name in first.not_trusted}
         first = fit(prior.loosened(free))
     settled = _settled(prior, fit, free, first, limit)
     if first.converged and not (free or settled.moves.free):

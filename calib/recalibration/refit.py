@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 from calib.problem import Problem
@@ -10,12 +11,14 @@ from calib.problem.prior import JointPrior
 from calib.recalibration.letgo import ALARM, let_go
 from calib.recalibration.links import Link
 from calib.recalibration.newer import RefittedPrior
+from calib.recalibration.odds import FREEDOMS
 from calib.recalibration.prior import change
 from calib.results.errors import errors_at
 from calib.results.intervals import Intervals, intervals
 from calib.results.sigmas import widened
 from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress, shapes_freed, solve
+from calib.solve.otherwise.elsewhere import room_elsewhere
 
 
 class _Fit(NamedTuple):
@@ -35,6 +38,7 @@ def solve_from(
     The tests of links take errors of the prior and of the newer rows for independent. Errors of a
     mesh that both share move the two alike, so changes are smaller than these tests have it.
     """
+    problem, begin = _where_the_room_is(problem, prior)
     found: list[_Fit] = []
     first: list[_Fit] = []  # of the prior as it is, with which `let_go` begins, and may end
 
@@ -45,14 +49,17 @@ def solve_from(
         return found[-1].told
 
     def fit_anew(prior: JointPrior) -> _Fit:
-        estimate = solve(problem, prior, progress=progress)
-        freed = shapes_freed(estimate, model, prior)
+        # Trackers alone would take a frame that is let go back to where the earlier run has it.
+        there = {name: problem.initial[name] for name in prior.freed if name in begin}
+        held = replace(prior, means={**prior.means, **there})
+        estimate = solve(problem, held, progress=progress)
+        freed = shapes_freed(estimate, model, held)
         known = intervals(freed, progress)
         seen = errors_at(estimate.problem, estimate.values)
         wide = widened(known, estimate, seen, prior.variables)
-        held, at_least = (each.of(prior.variables).without_repeated for each in (known, wide))
+        told, at_least = (each.of(prior.variables).without_repeated for each in (known, wide))
         moved, turned = change(prior, estimate.values)
-        covariances = (held.graph, held.covariance, at_least.covariance)
+        covariances = (told.graph, told.covariance, at_least.covariance)
         graph, covariance, widest = (turned @ each @ turned.T for each in covariances)
         now = RefittedPrior(
             change=moved,
@@ -64,5 +71,18 @@ def solve_from(
         )
         return _Fit(now, (estimate, freed, known))
 
-    links = let_go(prior, fit, alarm)
+    links = let_go(prior, fit, alarm, begin)
     return *found[-1].whole, links
+
+
+def _where_the_room_is(problem: Problem, prior: JointPrior) -> tuple[Problem, dict[str, float]]:
+    """The problem with each frame of the reference, of which only scans tell, where these lie on
+    the mesh, if that is not where the earlier run has it; and by how many of its sigmas each of
+    these frames may have moved."""
+    values, free = problem.initial | dict(prior.means), {}
+    for variable in (v for v in prior.held if v.kind == "pose"):
+        T = room_elsewhere(problem, values, variable.name)
+        if T is not None:
+            values[variable.name], free[variable.name] = T, float(FREEDOMS[-1])
+    initial = problem.initial | {name: values[name] for name in free}
+    return (replace(problem, initial=initial) if free else problem), free

@@ -34,7 +34,7 @@ from calib.solve.otherwise.orientations import lidars_turned
 from calib.solve.otherwise.readings import readings_of
 from calib.solve.otherwise.rooms import rooms_turned
 from chains import remote, se3
-from chains.errors import InputError
+from chains.errors import InputError, UntiedError
 from sensors.recording import RecordedStops, read_scan
 from sensors.reference import Reference
 from sensors.stops import read_targets
@@ -179,6 +179,8 @@ class _Checker:
         """What the function returns, or None where it found a problem, which is noted once."""
         try:
             return function(*args)
+        except UntiedError:  # which a fit from an earlier run does not mind
+            raise
         except InputError as error:
             if str(error) not in self.found.problems:
                 self.found.problems.append(str(error))
@@ -211,7 +213,11 @@ class _Checker:
         """Build the graph and linearise it once, without scans that are a problem already."""
         model = Model.of(None, (), (), [source.recording.folder])
         build = partial(problems.build, progress=self.progress)
-        problem = self._attempt(build, [source], model)
+        try:
+            problem = self._attempt(build, [source], model)
+        except UntiedError as error:
+            self.found.odd.append(str(error))
+            return
         if problem is None:
             return
         readable = [scan for scan in problem.scans if scan.name in scans.points]

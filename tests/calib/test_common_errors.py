@@ -5,40 +5,27 @@ The oracles are what comes of a fit where such an error is another; one recordin
 all that was measured anew; and a joint fit, in which the mesh is one.
 """
 
-import shutil
-
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from calib.effects import find
 from calib.problem.model import Source
 from calib.problem.prior import CommonErrors, JointPrior
 from calib.problem.surfaces import SURFACE_SHARES
 from calib.problem.unknowns import vector_unknown
 from calib.results.intervals import Intervals
-from calib.runs.calibrate import calibrate, grow
-from calib.runs.reopen import model_of
-from calib.simulation import Spec, simulate
+from calib.runs.calibrate import calibrate
+from calib.simulation import Spec
 from chains import se3
 from chains.errors import InputError
 
 from ..mishaps import Scene
+from .halves import halves
 
 SPHERES = Spec(lidar=None, mesh=False, targets=8, locations=4, stops_per_location=4, noise=0.0)
 ROOM = Spec(lidar="hesai_pandarxt32", column_step=60, targets=3, locations=4, mesh_error_m=0.002)
 AGAIN_M = 1e-7  # markers that were tracked again are another measurement, however near
 NUDGE_M = 4e-4  # no fit ends a hundredth of it from its optimum
-
-
-def halves(spec, folder):
-    simulate(spec, folder / "whole", seed=5)
-    with Scene(folder / "whole", np.random.default_rng()).sheet("stops.csv") as stops:
-        count = len(stops)
-    for half, kept in (("first", range(count // 2)), ("second", range(count // 2, count))):
-        shutil.copytree(folder / "whole", folder / half)
-        with Scene(folder / half, np.random.default_rng()).sheet("stops.csv") as stops:
-            stops.keep(list(kept))
 
 
 def spheres(folder):
@@ -247,22 +234,3 @@ def test_a_file_holds_errors_in_common(tmp_path):
         again = CommonErrors.read(dict(arrays), 3)
     assert again.names.tolist() == ["a", "bc"] and again.by.tolist() == common.by.tolist()
     assert CommonErrors.read({"names": np.zeros(2)}, 3) is None
-
-
-def test_a_recording_that_nothing_ties_to_the_room_starts_where_the_earlier_run_has_it(
-    once, tmp_path
-):
-    """It cannot be fitted alone. What is made of its run later finds its start there, too."""
-    home = once(room)
-    first = fitted(home / "first", tmp_path / "first")
-    (home / "second" / "targets.csv").unlink()
-    with Scene(home / "second", np.random.default_rng()).sheet("stops.csv") as stops:
-        for name in (n for n in stops.columns if "_markers." in n):
-            stops.columns[name][1] = ""  # where the scanner is, is asked for such stops first
-    with pytest.raises(InputError, match=r"nothing ties 'faro' to 'opti'.*--prior"):
-        fitted(home / "second", tmp_path / "alone")
-    run = calibrate(home / "second", tmp_path / "run", prior=first.folder)
-    assert run.summary["converged"] and not any(link["moved"] for link in run.summary["links"])
-    assert run.summary["rms_mm"]["fit"] < 1.2 * run.summary["rms_mm"]["noise_floor"]
-    again = grow(run, model_of(run).plus((find("incidence_angle_bias"),)), tmp_path / "grown")
-    assert again.summary["converged"]

@@ -90,7 +90,7 @@ def rooms_turned(problem: Problem, values: Values) -> Iterator[TurnedRoom]:
     """
     for number, scans in sampled_by_recording(problem, values).items():
         source = problem.sources[number]
-        if source.recording.base_guess is None or _tied(source):
+        if source.recording.base_guess is None or tied(source):
             continue
         cost = _costs(problem, scans)
         as_is = cost.pop(0)
@@ -101,7 +101,7 @@ def rooms_turned(problem: Problem, values: Values) -> Iterator[TurnedRoom]:
             yield TurnedRoom(source, alike, is_better=False)
 
 
-def _tied(source: Source) -> bool:
+def tied(source: Source) -> bool:
     """Whether targets say where the tracker is in the mesh."""
     return bool(source.rig.tracker and source.rig.target and source.recording.targets)
 
@@ -127,7 +127,7 @@ def _costs(problem: Problem, scans: Sequence[Sampled]) -> dict[int, np.ndarray]:
     # Scans that a tracker ties to each other are laid on the mesh as one.
     names = ["" if root in tracked else root for root in roots]
     group = np.unique(names, return_inverse=True)[1]
-    few, many = (_LaidScans.of(scans, group, most) for most in (LAID_BY, JUDGED_BY))
+    few, many = (LaidScans.of(scans, group, most) for most in (LAID_BY, JUDGED_BY))
     cost: dict[int, np.ndarray] = {}
     for degrees in TURNED_ABOUT_DEG:
         turn = few.about_middle(np.radians([0.0, 0.0, degrees, 0.0, 0.0, 0.0]))
@@ -140,7 +140,7 @@ def _costs(problem: Problem, scans: Sequence[Sampled]) -> dict[int, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class _LaidScans:
+class LaidScans:
     """Some beams of K scans, and how they are laid on the mesh.
 
     Args:
@@ -158,7 +158,7 @@ class _LaidScans:
     middle_m: np.ndarray
 
     @classmethod
-    def of(cls, scans: Sequence[Sampled], group: np.ndarray, most: int) -> _LaidScans:
+    def of(cls, scans: Sequence[Sampled], group: np.ndarray, most: int) -> LaidScans:
         """About so many beams of each."""
         rays = [each.some(most) for each in scans]
         beams = Beams(
@@ -177,6 +177,13 @@ class _LaidScans:
         """(..., 4, 4) motions by twists (..., 6), rad and m, about the middle of the room."""
         shift = se3.from_xyz_rpy(self.middle_m, np.zeros(3))
         return shift @ se3.exp(twist) @ se3.inverse(shift)
+
+    def centred(self, T: np.ndarray, within: tuple[float, float]) -> np.ndarray:
+        """A motion (4, 4) of all scans, moved on so that the middle of what they see, between these
+        quantiles along each axis, is that of the room."""
+        seen_m = self.beams.origin_m + self.beams.range_m[:, None] * self.beams.direction
+        middle_m = np.quantile(se3.apply(T, seen_m), within, axis=0).mean(axis=0)
+        return se3.from_xyz_rpy(self.middle_m - middle_m, np.zeros(3)) @ T
 
     def _off(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Beams]:
         """Which beams (N,) meet anything with scans moved by T (K, 4, 4), how far (N,) m they end

@@ -1,0 +1,65 @@
+"""Where a room is, of which nothing but its scans tells that: neither targets nor a guess.
+
+A fit from an earlier run begins where that had the room. Where the tracker, or the scanner, was set
+up anew since, scans meet other walls than they saw, and a fit that begins there ends there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.problem.problem import Problem
+from calib.solve.otherwise.rooms import JUDGED_BY, LAID_BY, NARROWED_M, LaidScans, tied
+from calib.solve.otherwise.sampled import Values, sampled_by_recording
+from chains import se3
+
+TURNED_BY_DEG = 15.0  # between starts about the vertical, each of which is right within half of it
+LAID_ANEW = 4  # of these starts, the best: a choice
+# Share of a scan's beams within which a room's middle is that of what they see: a choice, so that
+# what they see through a door does not count.
+MIDDLE = (0.02, 0.98)
+# Share of its beams by which a scan fits better elsewhere, on average, from which the room is
+# there: where it had stayed they fitted 0.004 better, 60 mm off 0.2, and metres or half a turn off
+# 0.3 to 1.0. What is 20 mm off, the fit finds by itself.
+FITS_BETTER = 0.05
+
+
+def room_elsewhere(problem: Problem, values: Values, frame: str) -> np.ndarray | None:
+    """T_world_reference (4, 4) of a frame of which only scans tell where it is, where these fit the
+    mesh notably better than at a state; None where they do not, or something else tells.
+
+    Args:
+        problem: with scans.
+        values: the state.
+        frame: of the mesh.
+    """
+    sources = [s for s in problem.sources if s.rig.reference_frame == frame]
+    if any(tied(s) or s.recording.base_guess is not None for s in sources):
+        return None
+    tracked = {body.stops.root for body in problem.bodies}
+    every = (each for some in sampled_by_recording(problem, values).values() for each in some)
+    scans = [e for e in every if e.scan.stops.reference == frame and e.scan.stops.root in tracked]
+    if not scans:
+        return None
+    count = len(scans)  # which a tracker ties to each other: they are laid on the mesh as one
+    few, many = (LaidScans.of(scans, np.zeros(count, int), most) for most in (LAID_BY, JUDGED_BY))
+    starts, costs = [np.eye(4)], []
+    for degrees in np.arange(0.0, 360.0, TURNED_BY_DEG):
+        turned = few.about_middle(np.radians([0.0, 0.0, degrees, 0.0, 0.0, 0.0]))
+        starts.append(few.centred(turned, MIDDLE))
+        costs.append(few.cost(_all(starts[-1], count), NARROWED_M[0]).mean())
+    best = many.cost(_all(starts[0], count), NARROWED_M[-1]).mean() - FITS_BETTER
+    where = None
+    for i in (0, *(1 + np.argsort(costs)[:LAID_ANEW]).tolist()):
+        T = _all(starts[i], count)
+        for width_m in NARROWED_M:
+            T = few.nearer(T, width_m)
+        T = many.nearer(T, NARROWED_M[-1])
+        if (cost := many.cost(T, NARROWED_M[-1]).mean()) < best:
+            best, where = cost, T[0]
+    return None if where is None else values[frame] @ se3.inverse(where)
+
+
+def _all(T: np.ndarray, count: int) -> np.ndarray:
+    """The same motion (4, 4) for each scan."""
+    return np.tile(T, (count, 1, 1))
