@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.problem.problem import Problem
 from calib.solve.otherwise.rooms import JUDGED_BY, LAID_BY, NARROWED_M, LaidScans, tied
-from calib.solve.otherwise.sampled import Values, sampled_by_recording
+from calib.solve.otherwise.sampled import Values, asked, sampled_by_recording
 from chains import se3
 
 TURNED_BY_DEG = 15.0  # between starts about the vertical, each of which is right within half of it
@@ -26,7 +26,8 @@ FITS_BETTER = 0.05
 
 def room_elsewhere(problem: Problem, values: Values, frame: str) -> np.ndarray | None:
     """T_world_reference (4, 4) of a frame of which only scans tell where it is, where these fit the
-    mesh notably better than at a state; None where they do not, or something else tells.
+    mesh notably better than at a state; None where they do not, or something else tells. It may be
+    anywhere, and turned about its vertical by anything.
 
     Args:
         problem: with scans.
@@ -41,6 +42,7 @@ def room_elsewhere(problem: Problem, values: Values, frame: str) -> np.ndarray |
     scans = [e for e in every if e.scan.stops.reference == frame and e.scan.stops.root in tracked]
     if not scans:
         return None
+    scans = asked([each for each in scans if each.scan.room == scans[0].scan.room])
     count = len(scans)  # which a tracker ties to each other: they are laid on the mesh as one
     few, many = (LaidScans.of(scans, np.zeros(count, int), most) for most in (LAID_BY, JUDGED_BY))
     starts, costs = [np.eye(4)], []
