@@ -23,7 +23,7 @@ from calib.problem.model import Model, Source
 from calib.problem.without import leave_out, placed
 from calib.recalibration.links import Link, moved_since_cad, since
 from calib.recalibration.prior import earlier, starting_from, untold
-from calib.recalibration.refit import solve_from
+from calib.recalibration.refit import hardly_apart, solve_from
 from calib.recalibration.twice import all_once, refuse_given_twice
 from calib.results.errors import OF_POSITIONS, Errors, body_errors, errors_at, of_orientations
 from calib.results.holdout import Keep, held_out, unit_of
@@ -265,7 +265,8 @@ def _fit(
     write_state(folder, estimate.state, stored_met(estimate.start, sources))
     write_yaml(folder / MODEL, document)
     summary = _summary(problem, estimate, nominal, seen, unseen)
-    summary["odd"] = [*odd(estimate), *(untold(held, choices.prior) if held else ())]
+    doubts = untold(held, choices.prior) if held else ()
+    summary["odd"] = [*odd(estimate), *doubts, *hardly_apart(problem, links)]
     write_rows(folder / RESIDUALS, rows := instrument_rows(estimate))
     if before:
         summary |= since(links, before.summary)

@@ -76,6 +76,21 @@ def test_a_tracker_that_was_set_up_anew_is_what_moved(once, tmp_path, twist):
     assert np.abs(off / np.hypot(sigma_then, sigma_now)).max() < 4.0
 
 
+def test_few_scans_do_not_tell_a_room_from_a_lidar_that_moved(once, tmp_path):
+    """That is said, and not of many scans."""
+    home = once(without_targets)
+    first = fitted(home / "first", tmp_path / "first")
+    tracked_from(home / "second", (0, 0, 0, 0.05, -0.03, 0))
+    many = fitted(home / "second", tmp_path / "many", prior=first.folder)
+    with Scene(home / "second", np.random.default_rng()).sheet("stops.csv") as stops:
+        stops.keep([0, 1])
+    few = fitted(home / "second", tmp_path / "few", prior=first.folder)
+    said = "that 'faro' moved is told by 2 scans alone"
+    assert any(each.startswith(said) for each in few.summary["odd"])
+    assert not any("scans alone" in each for each in many.summary["odd"])
+    assert [link["name"] for link in few.summary["links"] if link["moved"]] == ["faro"]
+
+
 def test_a_room_that_stayed_is_not_looked_for_elsewhere(once, tmp_path):
     home = once(without_targets)
     first = fitted(home / "first", tmp_path / "first")
