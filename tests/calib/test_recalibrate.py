@@ -102,7 +102,8 @@ def world(monkeypatch):
         monkeypatch.setattr(refit, "errors_at", lambda *_: None)
         monkeypatch.setattr(refit, "widened", lambda known, *_: known)
         prior = JointPrior(variables, values(m), then)
-        problem = SimpleNamespace(calibration=NAMES, variables={v.name: v for v in variables})
+        named = {v.name: v for v in variables}
+        problem = SimpleNamespace(calibration=NAMES, variables=named, initial={})
         return {link.name: link for link in refit.solve_from(problem, Model(), prior, None)[-1]}
 
     return at
