@@ -181,8 +181,8 @@ def _of_one_day(told: Mapping[str, Any], first: str) -> dict[str, Any]:
     """
     name, later = told["name"], told["recording"]
     said = (
-        f"{name} is of {later} alone, or has another size there than in {first}, and one fit takes "
-        f"it for the same; {FIT_APART}, which tells its time and size"
+        f"{name} belongs to {later} alone, or has another size there than in {first}, and one fit "
+        f"takes it for the same; {FIT_APART}, which tells its time and size"
     )
     return {**told, "sentence": whole(said)} | dict.fromkeys(("size", "unit", "sigma", "axis"))
 

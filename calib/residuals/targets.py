@@ -82,15 +82,19 @@ class HangingTarget:
         return np.repeat([self.sigma_marker_m, self.sigma_marker_m, self.sigma_sphere_m], 3)
 
     @property
+    def part_weights(self) -> np.ndarray:
+        """(3,) of each of `TARGET_PARTS`."""
+        return np.ones(len(TARGET_PARTS)) if self.weight is None else self.weight
+
+    @property
     def weights(self) -> np.ndarray:
         """(9,) of its rows."""
-        return np.ones(self.rows) if self.weight is None else np.repeat(self.weight, 3)
+        return np.repeat(self.part_weights, 3)
 
     def without_sphere(self) -> HangingTarget:
         """The target where its sphere says nothing."""
-        weight = np.ones(len(TARGET_PARTS)) if self.weight is None else self.weight
         counts = [part != "sphere" for part in TARGET_PARTS]
-        return replace(self, weight=np.where(counts, weight, 0.0))
+        return replace(self, weight=np.where(counts, self.part_weights, 0.0))
 
     def scattering(self, of: str, sd: float) -> HangingTarget:
         """The target with another spread beyond the sigma of its sphere, or of its markers."""

@@ -51,6 +51,7 @@ from calib.linear.own import own_rows
 from calib.linear.rows import PLACES
 from calib.problem import Problem
 from calib.problem.prior import CommonErrors, JointPrior
+from calib.problem.problem import Block
 from calib.problem.unknowns import Role
 from calib.residuals.targets import TARGET_PARTS, HangingTarget
 from calib.solve.clustered import BeamsAlong, of_cells, of_graph
@@ -238,7 +239,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     frames, paper, given = in_cad(problem), *np.zeros((2, *estimate.kept.shape))
     known = layout.outer()
     before = {name: unknown.sigma for name, unknown in known.items()}
-    for block, name, rows in of_graph(estimate.graph, layout, values):
+    for block, name, rows in (graph_rows := [*of_graph(estimate.graph, layout, values)]):
         stated = block is None and problem.variables[name].role in KNOWN_BEFORE
         if stated or isinstance(block, JointPrior):
             A = rows.along(directions).A
@@ -258,7 +259,7 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     for name, lost in estimate.not_trusted.items():
         at = np.searchsorted(layout.kept, layout.columns([name])[lost])
         wider[at] = np.maximum(wider[at], before[name][lost] / sigma[at])
-    repeated, common = _in_common(estimate, directions * sigma)
+    repeated, common = _in_common(estimate, graph_rows, directions, sigma)
     return Intervals(
         names=tuple(known),
         dims=tuple(unknown.dim for unknown in known.values()),
@@ -272,36 +273,42 @@ def intervals(estimate: Estimate, progress: Progress = lambda what, done, total:
     )
 
 
-def _in_common(estimate: Estimate, covariance: np.ndarray) -> tuple[np.ndarray, CommonErrors]:
+def _in_common(
+    estimate: Estimate,
+    graph_rows: Sequence[tuple[Block | None, str, ClusteredRows]],
+    directions: np.ndarray,
+    sigma: np.ndarray,
+) -> tuple[np.ndarray, CommonErrors]:
     """What errors that reach an estimate in several ways add to its covariance (Q, Q), and how it
-    goes with all that other runs may share; from the covariance (U, Q) of all unknowns with its
-    parameters."""
-    ways = _of_mesh(estimate, covariance)
-    for block, _, rows in of_graph(estimate.graph, estimate.linear.layout, estimate.values):
-        if isinstance(block, JointPrior):
-            ways.append(block.off_by(rows.along(covariance).A))
-        elif isinstance(block, HangingTarget):
-            ways.append(_of_target(block, rows.along(covariance).A))
-    return CommonErrors.together(ways, covariance.shape[1])
-
-
-def _of_mesh(estimate: Estimate, covariance: np.ndarray) -> list[CommonErrors]:
-    """Parts of meshes, by their kind. What an estimate is off by goes with the true error of a part
-    as it goes with what is left of that, the other way.
+    goes with all that other runs may share.
 
     Args:
         estimate: the solution.
-        covariance: (U, Q) of all unknowns with the parameters.
+        graph_rows: as of `of_graph`.
+        directions: (U, Q) covariance of all unknowns with the parameters, over their sigmas.
+        sigma: (Q,) of the parameters.
     """
+    ways = _of_mesh(estimate, directions, sigma)
+    for block, _, rows in graph_rows:
+        if isinstance(block, JointPrior):
+            ways.append(block.off_by(rows.along(directions).A * sigma))
+        elif isinstance(block, HangingTarget):
+            ways.append(_of_target(block, rows.along(directions).A * sigma))
+    return CommonErrors.together(ways, len(sigma))
+
+
+def _of_mesh(estimate: Estimate, directions: np.ndarray, sigma: np.ndarray) -> list[CommonErrors]:
+    """Parts of meshes, by their kind; arguments as of `_in_common`. What an estimate is off by goes
+    with the true error of a part as it goes with what is left of that, the other way."""
     found, problem = [], estimate.problem
     for unknown, cells in problem.cells.items():
         if cells.of_mesh:
             width_m = problem.meetings[cells.room].patches_m.get(cells.column, 0.0)
             mesh = f"{problem.sources[cells.room].reference.digest} {cells.column} {width_m:.4f}"
             names = [f"{mesh} {cells.axis} {part}" for part in cells.parts.tolist()]
-            rows = covariance[estimate.linear.layout.columns([unknown])]
-            sigma = problem.variables[unknown].sigma
-            found.append(CommonErrors(np.array(names), -rows / sigma[:, None]))
+            rows = directions[estimate.linear.layout.columns([unknown])] * sigma
+            by = -rows / problem.variables[unknown].sigma[:, None]
+            found.append(CommonErrors(np.array(names), by))
     return found
 
 

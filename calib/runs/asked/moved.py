@@ -100,8 +100,8 @@ def moved(a: Run, b: Run) -> Moved:
             f"one: rigcal fit {recordings} -o NEW --prior {a.folder}"
         )
     told = (
-        "Different recordings: their errors are independent, those of a mesh that both have taken "
-        "for such, and CAD counts once"
+        "Different recordings: their errors, those of a mesh that both rest on too, are taken for "
+        "independent, and CAD counts once"
     )
     links = _documents(_apart(Pair.of(a, b), b))
     return Moved((a, b), INDEPENDENT, links, bounds=(), remarks=(told, *differ))

@@ -105,7 +105,7 @@ def _of_targets(
     variances = linear.variances([by for _, by, _ in rows], kept)
     sums: dict[str, list[tuple[float, float]]] = {}
     for (block, _, residual), seen in zip(rows, variances, strict=True):
-        weight = np.ones(len(TARGET_PARTS)) if block.weight is None else block.weight
+        weight = block.part_weights
         whole = replace(block.groups[0], what=ROD) in wild
         for of, parts in PARTS_OF_SIGMAS.items():
             for i in (TARGET_PARTS.index(part) for part in parts):

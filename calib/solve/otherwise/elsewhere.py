@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.problem.problem import Problem
-from calib.solve.otherwise.rooms import JUDGED_BY, LAID_BY, NARROWED_M, LaidScans, tied
+from calib.solve.otherwise.rooms import JUDGED_BY, LAID_BY, NARROWED_M, LaidScans, laid, tied
 from calib.solve.otherwise.sampled import Values, asked, sampled_by_recording
 from chains import se3
 
@@ -43,25 +43,16 @@ def room_elsewhere(problem: Problem, values: Values, frame: str) -> np.ndarray |
     if not scans:
         return None
     scans = asked([each for each in scans if each.scan.room == scans[0].scan.room])
-    count = len(scans)  # which a tracker ties to each other: they are laid on the mesh as one
-    few, many = (LaidScans.of(scans, np.zeros(count, int), most) for most in (LAID_BY, JUDGED_BY))
-    starts, costs = [np.eye(4)], []
+    together = np.zeros(len(scans), int)  # a tracker ties them to each other
+    few, many = (LaidScans.of(scans, together, most) for most in (LAID_BY, JUDGED_BY))
+    starts, costs = [], []
     for degrees in np.arange(0.0, 360.0, TURNED_BY_DEG):
         turned = few.about_middle(np.radians([0.0, 0.0, degrees, 0.0, 0.0, 0.0]))
         starts.append(few.centred(turned, MIDDLE))
-        costs.append(few.cost(_all(starts[-1], count), NARROWED_M[0]).mean())
-    best = many.cost(_all(starts[0], count), NARROWED_M[-1]).mean() - FITS_BETTER
-    where = None
-    for i in (0, *(1 + np.argsort(costs)[:LAID_ANEW]).tolist()):
-        T = _all(starts[i], count)
-        for width_m in NARROWED_M:
-            T = few.nearer(T, width_m)
-        T = many.nearer(T, NARROWED_M[-1])
-        if (cost := many.cost(T, NARROWED_M[-1]).mean()) < best:
-            best, where = cost, T[0]
+        costs.append(few.cost(few.alike(starts[-1]), NARROWED_M[0]).mean())
+    where, best = None, many.cost(many.alike(np.eye(4)), NARROWED_M[-1]).mean() - FITS_BETTER
+    for start in (np.eye(4), *(starts[i] for i in np.argsort(costs)[:LAID_ANEW])):
+        T, cost = laid(few, many, start)
+        if cost.mean() < best:
+            where, best = T[0], cost.mean()
     return None if where is None else values[frame] @ se3.inverse(where)
-
-
-def _all(T: np.ndarray, count: int) -> np.ndarray:
-    """The same motion (4, 4) for each scan."""
-    return np.tile(T, (count, 1, 1))

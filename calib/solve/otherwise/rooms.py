@@ -131,12 +131,18 @@ def _costs(problem: Problem, scans: Sequence[Sampled]) -> dict[int, np.ndarray]:
     cost: dict[int, np.ndarray] = {}
     for degrees in TURNED_ABOUT_DEG:
         turn = few.about_middle(np.radians([0.0, 0.0, degrees, 0.0, 0.0, 0.0]))
-        T = np.tile(turn, (len(group), 1, 1))
-        for width_m in NARROWED_M:
-            T = few.nearer(T, width_m)
-        T = many.nearer(T, NARROWED_M[-1])
-        cost[degrees] = many.cost(T, NARROWED_M[-1])
+        _, cost[degrees] = laid(few, many, turn)
     return cost
+
+
+def laid(few: LaidScans, many: LaidScans, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scans laid on the mesh from where one motion (4, 4) of all puts them, by some of their beams,
+    and then by more: their motions (K, 4, 4), and the share (K,) of the beams that do not fit."""
+    T = few.alike(start)
+    for width_m in NARROWED_M:
+        T = few.nearer(T, width_m)
+    T = many.nearer(T, NARROWED_M[-1])
+    return T, many.cost(T, NARROWED_M[-1])
 
 
 @dataclass(frozen=True)
@@ -177,6 +183,10 @@ class LaidScans:
         """(..., 4, 4) motions by twists (..., 6), rad and m, about the middle of the room."""
         shift = se3.from_xyz_rpy(self.middle_m, np.zeros(3))
         return shift @ se3.exp(twist) @ se3.inverse(shift)
+
+    def alike(self, T: np.ndarray) -> np.ndarray:
+        """The same motion (4, 4) for each scan, (K, 4, 4)."""
+        return np.tile(T, (len(self.group), 1, 1))
 
     def centred(self, T: np.ndarray, within: tuple[float, float]) -> np.ndarray:
         """A motion (4, 4) of all scans, moved on so that the middle of what they see, between these
