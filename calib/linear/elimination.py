@@ -8,6 +8,7 @@ factored whatever the data leave open.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,21 +57,39 @@ def eliminate(
 
     Args:
         block: (e, e) of those, positive definite, of which only what is on the diagonal and below
-            it is read; or (e,) where it is diagonal.
+            it is read.
         cross: (e, r) of them and the others.
         rest: (r, r) of the others, symmetric and contiguous; the Schur complement takes its place.
 
     Returns:
         The factor and the gain, as `Eliminated` has them.
     """
-    if block.ndim == 1:
-        root = np.sqrt(block)[:, None]
-        _take_square(rest, cross / root)
-        return block, cross / block[:, None]
-    factor = cholesky(block, lower=True, check_finite=False)
-    half = solve_triangular(factor, cross, lower=True, check_finite=False)
-    _take_square(rest, half)
-    return factor, solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
+    ((factor, gain),) = eliminate_apart(block, cross, rest, [len(block)])
+    return factor, gain
+
+
+def eliminate_apart(
+    block: np.ndarray, cross: np.ndarray, rest: np.ndarray, sizes: Sequence[int]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Take sets of unknowns, which nothing ties to each other, out of normal equations.
+
+    Args:
+        block: (e, e), cross, rest: as of `eliminate`.
+        sizes: how many of the e each set has, one set after the other; none of them is empty.
+
+    Returns:
+        The factor and the gain of each.
+    """
+    found, halves, first = [], np.empty(cross.shape), 0
+    for size in sizes:
+        some, first = slice(first, first + size), first + size
+        factor = cholesky(block[some, some], lower=True, check_finite=False)
+        half = solve_triangular(factor, cross[some], lower=True, check_finite=False)
+        halves[some] = half
+        gain = solve_triangular(factor, half, lower=True, trans=1, check_finite=False)
+        found.append((factor, gain))
+    _take_square(rest, halves)
+    return found
 
 
 def _take_square(symmetric: np.ndarray, rows: np.ndarray) -> None:

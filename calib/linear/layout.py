@@ -2,8 +2,8 @@
 
 Unknowns are of three kinds. *Own* unknowns of a stop (where the rig stands, what its encoders
 misreport) are touched by that stop alone, or by nothing but their prior. *Cells* say how far parts
-of the mesh stand off the room; no row touches two of the finest cells, so their block of the normal
-equations is diagonal. All others are *kept*: they go to the factor graph.
+of the mesh stand off the room; no row touches cells of two surfaces, so their block of the normal
+equations falls apart by surface. All others are *kept*: they go to the factor graph.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ StopKey = tuple[object, int]
 # Least change of a whitened row by a prior sigma of an unknown: rounding of 1 m is 2e-16 m, which
 # in rows with a sigma of 1 um is 2e-10.
 ROUNDED_ROW = 1e-9
+CELLS_AT_ONCE = 64  # blocks of fewer take longer to call for than to factor
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Layout:
         stops: recording's folder and number of a stop -> its number here.
         own: stop -> columns of its own unknowns.
         owner: (U,) the stop whose own unknown stands in a column, -1 for those of no stop.
-        finest: (C,) columns of the finest cells of each mesh; cells: (D,) of all others.
+        cells: columns (n,) of the cells of each surface, or of a few surfaces that have few.
         kept: (S,) columns that are not eliminated, ascending.
         bodies: the problem's blocks of seen bodies that depend on stops' own unknowns.
         others: the problem's other blocks; the graph takes them as they are.
@@ -54,8 +55,7 @@ class Layout:
     stops: Mapping[StopKey, int]
     own: Mapping[int, np.ndarray]
     owner: np.ndarray
-    finest: np.ndarray
-    cells: np.ndarray
+    cells: Sequence[np.ndarray]
     kept: np.ndarray
     bodies: Sequence[BodiesTogether]
     others: Sequence[Block]
@@ -98,8 +98,8 @@ class Layout:
         own: dict[int, list[np.ndarray]] = {}
         for name in (n for n in unknowns if owner.get(n, -1) >= 0):
             own.setdefault(owner[name], []).append(np.r_[at[name]])
-        finest, cells = (_join(at, names) for names in _cells(unknowns))
-        inner = [*own.values(), [finest], [cells]]
+        cells = _cells(problem, at)
+        inner = [*own.values(), cells, [np.zeros(0, int)]]
         whose = np.full(ends[-1], -1)
         for stop, columns in own.items():
             whose[np.concatenate(columns)] = stop
@@ -114,7 +114,6 @@ class Layout:
             stops=stops,
             own={stop: np.concatenate(columns) for stop, columns in own.items()},
             owner=whose,
-            finest=finest,
             cells=cells,
             kept=np.setdiff1d(np.arange(ends[-1]), eliminated),
             bodies=BodiesTogether.of(bodies),
@@ -196,15 +195,19 @@ def keys_of(block: Block) -> Sequence[StopKey]:
     return block.stop_names if isinstance(block, SeenBody) else ()
 
 
-def _cells(unknowns: Mapping[str, Unknown]) -> tuple[list[str], list[str]]:
-    """Surfaces' unknowns: of each mesh that with most components, and all others."""
-    finest: dict[int, str] = {}
-    found = [n for n, u in unknowns.items() if u.role is Role.SURFACE]
-    for name in found:
-        mesh = unknowns[name].owner.room
-        if mesh not in finest or unknowns[name].dim > unknowns[finest[mesh]].dim:
-            finest[mesh] = name
-    return list(finest.values()), [n for n in found if n not in finest.values()]
+def _cells(problem: Problem, at: Mapping[str, slice]) -> list[np.ndarray]:
+    """Columns of the cells of each surface, of small ones together with those of the next."""
+    found: dict[tuple[int | str, int], list[int]] = {}
+    for name, cells in problem.cells.items():
+        for column, surface in enumerate(cells.surface.tolist(), at[name].start):
+            found.setdefault((cells.room, surface), []).append(column)
+    sets: list[np.ndarray] = []
+    for columns in found.values():
+        if sets and len(sets[-1]) < CELLS_AT_ONCE:
+            sets[-1] = np.append(sets[-1], columns)
+        else:
+            sets.append(np.array(columns))
+    return sets
 
 
 def _join(at: Mapping[str, slice], names: Sequence[str]) -> np.ndarray:

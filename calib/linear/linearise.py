@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from calib.forward import Placed, place_each
-from calib.linear.assembly import Assembly, KeptSums
+from calib.linear.assembly import KeptSums, assembly_of
 from calib.linear.clusters import Gradients, summed
 from calib.linear.layout import Layout
 from calib.linear.own import OwnRows, own_rows
@@ -59,7 +59,7 @@ def linearise(
     layout = layout or Layout.of(problem)
     count = len(problem.scans) if beams else 0
     own = own_rows(layout, values) if own is None else own
-    assembly = Assembly(layout, own, gradients is not None)
+    assembly = assembly_of(layout, own, gradients is not None)
     placed = lidars(problem.scans, values) if count else []
     scans = problem.scans[:count]
     work = partial(_of_stop, layout, State(values), gradients is not None)

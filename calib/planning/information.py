@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from calib.linear.elimination import eliminate
+from calib.linear.elimination import eliminate, eliminate_apart
 from calib.linear.layout import Layout, positions
 from calib.linear.linearise import lidars, linearise
 from calib.linear.parallel import in_order
@@ -212,7 +212,6 @@ def _left(
     mine = np.unique(np.concatenate([np.zeros(0, int), *some]))
     at, size = positions(layout.size, mine), len(mine)
     whole = np.zeros((size, size))
-    patches = np.zeros(0, int)
     if sums:
         through = np.zeros((TWIST, size))
         through[:, at[sums.chain_columns]] = sums.chain
@@ -221,17 +220,19 @@ def _left(
         cross = through.T @ gram[:TWIST, TWIST + 1 :]
         add_both(whole, np.arange(size), place, cross)
         add_at(whole, place, place, gram[TWIST + 1 :, TWIST + 1 :])
-        patches = at[np.intersect1d(sums.columns, layout.finest)]
     for A, columns in bodies:
         whole[np.ix_(at[columns], at[columns])] += A.T @ A
     unit = layout.sigma[mine]
     whole *= np.outer(unit, unit)
     own = shared.at[mine] < 0
     whole[own, own] += 1.0  # what was known of each before
-    rest = np.setdiff1d(np.arange(size), patches)
+    sets = [some[some >= 0] for some in (at[columns] for columns in layout.cells)]
+    cells = np.concatenate([np.zeros(0, int), *sets])
+    rest = np.setdiff1d(np.arange(size), cells)
     left = np.ascontiguousarray(whole[np.ix_(rest, rest)])
-    if len(patches):
-        eliminate(np.diag(whole)[patches], whole[np.ix_(patches, rest)], left)
+    if len(cells):
+        block, cross = whole[np.ix_(cells, cells)], whole[np.ix_(cells, rest)]
+        eliminate_apart(block, cross, left, [len(some) for some in sets if len(some)])
     inner, outer = np.flatnonzero(own[rest]), np.flatnonzero(~own[rest])
     out = np.zeros((shared.size, shared.size))
     kept = np.ascontiguousarray(left[np.ix_(outer, outer)])

@@ -110,7 +110,7 @@ class BeamTable:
         others, b, others_stop, others_place = rows_of_others(problem, layout, values, places)
         twists = csr_array(vstack([d.twists for d in drawn]))
         chain = csr_array(vstack([*(d.chain for d in drawn), eye_array(layout.size, format="csr")]))
-        cells = np.concatenate([layout.finest, layout.cells])
+        cells = np.concatenate([np.zeros(0, int), *layout.cells])
         surfaces = apart(csr_array(vstack([twists @ chain, others])), cells)
         return cls(
             covariates={n: np.concatenate([d.column(n) for d in drawn]) for n in names},

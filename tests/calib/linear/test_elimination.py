@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
-from calib.linear.elimination import Eliminated, eliminate, square_root
+from calib.linear.elimination import Eliminated, eliminate, eliminate_apart, square_root
 from calib.problem import build
 from calib.problem.model import Model, Source
 
@@ -16,20 +17,19 @@ def equations(rng, count, scale=1.0):
     return A.T @ A, A
 
 
-@pytest.mark.parametrize("diagonal", [True, False])
-@pytest.mark.parametrize("count", [1, 6])
-def test_what_is_left_is_what_the_others_say_once_the_first_have_taken_all_they_can(
-    count, diagonal
-):
+@pytest.mark.parametrize("sizes", [[1], [6], [1, 1, 1, 1, 1, 1], [3, 1, 2]])
+def test_what_is_left_is_what_the_others_say_once_the_first_have_taken_all_they_can(sizes):
+    """Whether they are tied to each other or, set by set, are not."""
+    count = sum(sizes)
     rng = np.random.default_rng(count)
-    whole, A = equations(rng, 9, 10.0 ** np.array([-3, 2, 0, 1, -2, 3, 0, 0, -1, 2]))
-    if diagonal:
-        first, _ = np.linalg.qr(A[:, :count])
-        A = np.hstack([first * np.arange(1, count + 1), A[:, count:]])
-        whole = A.T @ A
-    block = np.diag(whole)[:count] if diagonal else whole[:count, :count]
-    left = whole[count:, count:].copy()
-    factor, gain = eliminate(block, whole[:count, count:], left)
+    _, A = equations(rng, 9, 10.0 ** np.array([-3, 2, 0, 1, -2, 3, 0, 0, -1, 2]))
+    apart, _ = np.linalg.qr(A[:, :count])
+    turn = block_diag(*(rng.normal(size=(n, n)) + 3.0 * np.eye(n) for n in sizes))
+    A = np.hstack([apart @ turn, A[:, count:]])
+    whole = A.T @ A
+    block, left = whole[:count, :count], whole[count:, count:].copy()
+    gone = eliminate_apart(np.tril(block), whole[:count, count:], left, sizes)
+    gain = np.vstack([gain for _, gain in gone])
     taken = np.linalg.lstsq(A[:, :count], A[:, count:], rcond=None)[0]
     beyond = A[:, count:] - A[:, :count] @ taken
     size = np.sqrt(np.diag(whole))
@@ -40,12 +40,13 @@ def test_what_is_left_is_what_the_others_say_once_the_first_have_taken_all_they_
     )
     np.testing.assert_array_equal(left, left.T)
     np.testing.assert_allclose(gain, taken, rtol=1e-7, atol=1e-9)
-    if diagonal:
-        return
     right = rng.normal(size=(count, 3))
-    gone = Eliminated(np.arange(count), np.arange(count, len(whole)), factor, gain)
-    expected = np.linalg.solve(whole[:count, :count], right)
-    np.testing.assert_allclose(gone.solve(right), expected, rtol=1e-7)
+    first, found = 0, []
+    for (factor, gain), n in zip(gone, sizes, strict=True):
+        one = Eliminated(np.arange(n), np.arange(n, len(whole)), factor, gain)
+        found.append(one.solve(right[first : first + n]))
+        first += n
+    np.testing.assert_allclose(np.vstack(found), np.linalg.solve(block, right), rtol=1e-7)
 
 
 def test_eliminated_one_by_one_or_at_once_the_rest_and_the_solution_are_the_same():

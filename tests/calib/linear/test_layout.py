@@ -42,7 +42,7 @@ def roots(*names):
 
 def assert_whole(layout):
     """Every column is one stop's own, a cell, or kept, and only one of these."""
-    every = [*layout.own.values(), layout.finest, layout.cells, layout.kept]
+    every = [*layout.own.values(), *layout.cells, layout.kept]
     np.testing.assert_array_equal(np.sort(np.concatenate(every)), np.arange(layout.size))
     sigma = np.concatenate([u.sigma for u in layout.unknowns.values()])
     np.testing.assert_array_equal(layout.sigma, sigma)
@@ -84,22 +84,37 @@ def test_a_location_of_one_stop_is_that_stops_own(problem, monkeypatch):
     assert_whole(layout)
 
 
-def test_of_a_meshs_cells_those_that_are_most_are_the_finest(problem):
+def surfaces_of(problem, columns):
+    """Mesh and surface of the cells that stand in columns."""
+    at = Layout.of(problem).at
+    return {
+        (cells.room, int(surface))
+        for name, cells in problem.cells.items()
+        for column, surface in enumerate(cells.surface, at[name].start)
+        if column in columns
+    }
+
+
+@pytest.mark.parametrize("at_once", [1, 64])
+def test_cells_of_a_surface_stand_together(problem, monkeypatch, at_once):
+    monkeypatch.setattr("calib.linear.layout.CELLS_AT_ONCE", at_once)
     found = problem()
     layout = Layout.of(found)
-    sizes = [found.variables[name].dim for name in CELLS]
-    assert sizes == sorted(sizes) and sizes[0] == 6 < sizes[1] < sizes[2]
-    assert names_at(layout, layout.finest) == {CELLS[2]}
-    assert names_at(layout, layout.cells) == {*CELLS[:2], *TILTS}
+    each = [surfaces_of(found, columns) for columns in layout.cells]
+    assert len(set().union(*each)) == sum(map(len, each)) == 6
+    assert (max(map(len, each)) == 1) == (at_once == 1)
+    assert all(len(columns) >= at_once for columns in layout.cells[:-1])
+    assert names_at(layout, np.concatenate(layout.cells)) == {*CELLS, *TILTS}
     assert not {*CELLS, *TILTS} & set(layout.outer())
 
 
-def test_of_several_meshes_each_has_its_finest_and_of_one_mesh_only_one(tmp_path):
+def test_cells_of_one_mesh_are_those_of_all_recordings_in_it(tmp_path):
     same = [Source.open(rigs.write(tmp_path / str(k), seed=k)) for k in (1, 2)]
     moved = Source.open(rigs.write(tmp_path / "far", seed=3, offset_m=(5.0, 0.0, 0.0)))
     found = preview(build([*same, moved], Model())).problem
     layout = Layout.of(found)
-    assert names_at(layout, layout.finest) == {"0/reference_patch", "2/reference_patch"}
+    rooms = [{room for room, _ in surfaces_of(found, columns)} for columns in layout.cells]
+    assert set().union(*rooms) == {0, 2}
     assert_whole(layout)
 
 

@@ -6,6 +6,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from calib.linear import assembly
+from calib.linear.assembly import stops_first
 from calib.linear.clusters import Gradients
 from calib.linear.parallel import workers
 
@@ -13,6 +14,7 @@ from .. import rigs
 from .cases import CASES, made
 
 TOGETHER = {"one by one": 1, "all at once": 10**9}  # entries of stops that wait for each other
+ORDERS = ("cells first", *TOGETHER)
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -20,10 +22,17 @@ def case(request, tmp_path_factory):
     return made(request.param, tmp_path_factory.mktemp("linear"))
 
 
-@pytest.fixture(params=TOGETHER)
-def together(request, monkeypatch):
-    monkeypatch.setattr(assembly, "WAITING_ENTRIES", TOGETHER[request.param])
-    monkeypatch.setattr(assembly, "STOPS_TOGETHER", min(TOGETHER[request.param], 256))
+def eliminating(monkeypatch, order):
+    """Cells before what stops have for themselves; or after it, so many stops at once."""
+    monkeypatch.setattr(assembly, "begins_with_cells", lambda layout: order == "cells first")
+    entries = TOGETHER.get(order, 1)
+    monkeypatch.setattr(stops_first, "WAITING_ENTRIES", entries)
+    monkeypatch.setattr(stops_first, "STOPS_TOGETHER", min(entries, 256))
+
+
+@pytest.fixture(params=ORDERS)
+def order(request, monkeypatch):
+    eliminating(monkeypatch, request.param)
     return request.param
 
 
@@ -53,7 +62,7 @@ def sizes(matrix):
     return np.where(size > 0, size, 1.0)
 
 
-def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, together):
+def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, order):
     gradients = Gradients(len(case.dense.sigma))
     linear = case.linear(gradients=gradients)
     A, b = case.dense.some(in_linearisation(case))
@@ -84,7 +93,7 @@ def unknown_of(layout):
     return np.arange(len(kept)), [unknown.dim for unknown in kept]
 
 
-def test_what_is_touched_and_how_sure_beams_are(case, together):
+def test_what_is_touched_and_how_sure_beams_are(case, order):
     linear = case.linear()
     wanted = in_linearisation(case)
     A, _ = case.dense.some(lambda kind: wanted(kind) and not kind.startswith("prior"))
@@ -95,7 +104,7 @@ def test_what_is_touched_and_how_sure_beams_are(case, together):
     assert linear.weight_m2 == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_step_of_every_unknown_is_that_of_dense_rows(case, together):
+def test_the_step_of_every_unknown_is_that_of_dense_rows(case, order):
     """To a millionth of its sigma, and with it by how much the cost was to fall."""
     dense, linear = case.dense, case.linear()
     estimate = case.estimate(linear)
@@ -117,7 +126,7 @@ def test_the_step_of_every_unknown_is_that_of_dense_rows(case, together):
         np.testing.assert_allclose(after[name], stepped, atol=1e-9)
 
 
-def test_covariances_are_those_of_dense_rows(case, together):
+def test_covariances_are_those_of_dense_rows(case, order):
     """Of what is kept, of a stop's own, and of both together."""
     linear = case.linear()
     estimate, dense = case.estimate(linear), case.dense
@@ -132,12 +141,12 @@ def test_covariances_are_those_of_dense_rows(case, together):
             np.testing.assert_allclose(found, correlation[np.ix_(at, at)], atol=1e-6)
 
 
-def test_reduced_rows_say_the_same_of_all_that_follows_the_kept(case, together, monkeypatch):
+def test_reduced_rows_say_the_same_of_all_that_follows_the_kept(case, order, monkeypatch):
     """Rows about a few unknowns of any kind, of which one may stand twice, or about none."""
     monkeypatch.setattr("calib.linear.system.ROWS_AT_ONCE", 3)
     linear, rng = case.linear(), np.random.default_rng(6)
     layout, kept = linear.layout, np.diag(linear.layout.sigma[linear.layout.kept])
-    parts = [layout.finest, layout.cells, layout.kept, *layout.own.values()]
+    parts = [*layout.cells, layout.kept, *layout.own.values()]
     touched = [rng.choice(part, 3) for part in parts if len(part)] + [np.zeros(0, int)]
     touched += [np.concatenate([touched[0], some]) for some in touched]
     ends = np.cumsum([0, *map(len, touched)])
@@ -153,13 +162,13 @@ def test_reduced_rows_say_the_same_of_all_that_follows_the_kept(case, together, 
         np.testing.assert_array_equal(now, then)
 
 
-def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, together):
+def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, order):
     """Rows about one kind of unknown each, about all of them at once, and about nothing."""
     linear, dense = case.linear(), case.dense
     estimate, layout, rng = case.estimate(linear), linear.layout, np.random.default_rng(5)
     covariance = dense.covariance
     own = [*layout.own.values()]
-    parts = [layout.finest, layout.cells, layout.kept, *own[:1], *own[-1:], np.arange(layout.size)]
+    parts = [*layout.cells, layout.kept, *own[:1], *own[-1:], np.arange(layout.size)]
     rows = np.zeros((2 * len(parts) + 1, layout.size))
     for i, columns in enumerate(parts):
         some = rng.permutation(columns)[: 1 + len(columns) // 3]
@@ -176,7 +185,7 @@ def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, tog
 
 
 def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(
-    case, together, monkeypatch
+    case, order, monkeypatch
 ):
     """Of no set, of one, of several; also where not all rows are looked at at once."""
     linear = case.linear()
@@ -196,7 +205,7 @@ def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(
         np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, together):
+def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, order):
     """Of a twist that one stop alone has: its information, its score, its products with all."""
     linear, dense = case.linear(gradients=Gradients(len(case.dense.sigma))), case.dense
     assert case.linear().scans == {}, "nobody asked"
@@ -222,12 +231,12 @@ def test_what_beams_say_of_their_lidars_twist_is_what_their_rows_say(case, toget
         np.testing.assert_allclose(cross / unit, twist.T @ A / unit, atol=1e-9)
 
 
-def test_the_cost_is_half_the_sum_of_all_squares(case, together):
+def test_the_cost_is_half_the_sum_of_all_squares(case, order):
     estimate = case.estimate(case.linear())
     assert estimate.cost == pytest.approx(case.dense.b @ case.dense.b / 2, rel=1e-9)
 
 
-def test_gradients_by_cluster_are_those_of_their_rows(case, together):
+def test_gradients_by_cluster_are_those_of_their_rows(case, order):
     gradients = Gradients(len(case.dense.sigma))
     case.linear(gradients=gradients)
     chosen = np.flatnonzero(case.dense.kind == "beams")
@@ -251,21 +260,24 @@ def test_gradients_by_cluster_are_those_of_their_rows(case, together):
     np.testing.assert_allclose(table.sum(axis=0) / size, total / size, atol=1e-8)
 
 
-def test_stops_taken_out_one_by_one_or_at_once_say_the_same(case, monkeypatch):
+def test_whatever_is_eliminated_first_the_same_is_said(case, monkeypatch):
     found = []
-    for entries in TOGETHER.values():
-        monkeypatch.setattr(assembly, "WAITING_ENTRIES", entries)
+    for order in ORDERS:
+        eliminating(monkeypatch, order)
         found.append(case.linear(gradients=Gradients(len(case.dense.sigma))))
-    a, b = found
-    raw, other = (block_diag(*linear.raw.values()) for linear in found)
-    size = np.append(sizes(raw), np.sqrt(a.chi2))
+    first, *others = found
+    raw = block_diag(*first.raw.values())
+    size = np.append(sizes(raw), np.sqrt(first.chi2))
     unit = np.outer(size, size)
-    np.testing.assert_allclose(a.kept / unit, b.kept / unit, atol=1e-10)
-    np.testing.assert_allclose(raw / unit[:-1, :-1], other / unit[:-1, :-1], atol=1e-12)
-    assert a.chi2 == pytest.approx(b.chi2, rel=1e-12)
+    for other in others:
+        same = block_diag(*other.raw.values())
+        np.testing.assert_allclose(other.kept / unit, first.kept / unit, atol=1e-10)
+        np.testing.assert_allclose(same / unit[:-1, :-1], raw / unit[:-1, :-1], atol=1e-12)
+        assert other.chi2 == pytest.approx(first.chi2, rel=1e-12)
+        np.testing.assert_array_equal(other.touched, first.touched)
 
 
-def test_the_number_of_threads_changes_no_bit(case, together):
+def test_the_number_of_threads_changes_no_bit(case, order):
     def found(count):
         gradients = Gradients(len(case.dense.sigma))
         with workers(count):
