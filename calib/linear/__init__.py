@@ -18,11 +18,13 @@ region, patch), and the tilts of regions. All others, the calibration above all,
 **Elimination** (`elimination`) takes own unknowns and cells out by the Schur complement,
 ``H_kk - H_ke H_ee^-1 H_ek``: what remains says of the kept unknowns exactly what all rows say, and
 the gain ``H_ee^-1 H_ek`` leads back to those eliminated. The result does not depend on the order,
-the work does. `Assembly` (`assembly`) takes out stops first, so that no matrix grows with their
-number. What goes with a stop is the square of a few rows, six of which are wide, as a stop's beams
-know the LiDAR by six numbers; rows of many stops go into one product. Where a stop has no beams,
-its own rows are turned by QR until only some of them touch its own unknowns. All cells go at the
-end, in one block: there are never many more of them, however large the room.
+the work does, so that with less is chosen (`assembly`). Few stops in a room of many parts: cells
+go first, surface by surface, as no beam meets two, and then all that stops have for themselves.
+Many stops: these go first, so that no matrix grows with their number. What goes with a stop is the
+square of a few rows, six of which are wide, as a stop's beams know the LiDAR by six numbers; rows
+of many stops go into one product. Where a stop has no beams, its own rows are turned by QR until
+only some of them touch its own unknowns. All cells go at the end, in one block: there are never
+many more of them, however large the room.
 
 The `Linearisation` (`system`) that is left holds ``kept``: the normal equations of the kept
 unknowns and b, without their priors and without rows that touch kept unknowns only (targets, bodies

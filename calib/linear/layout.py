@@ -197,17 +197,17 @@ def keys_of(block: Block) -> Sequence[StopKey]:
 
 def _cells(problem: Problem, at: Mapping[str, slice]) -> list[np.ndarray]:
     """Columns of the cells of each surface, of small ones together with those of the next."""
-    found: dict[tuple[int | str, int], list[int]] = {}
-    for name, cells in problem.cells.items():
-        for column, surface in enumerate(cells.surface.tolist(), at[name].start):
-            found.setdefault((cells.room, surface), []).append(column)
-    sets: list[np.ndarray] = []
-    for columns in found.values():
-        if sets and len(sets[-1]) < CELLS_AT_ONCE:
-            sets[-1] = np.append(sets[-1], columns)
-        else:
-            sets.append(np.array(columns))
-    return sets
+    if not problem.cells:
+        return []
+    room = {some.room: i for i, some in enumerate(problem.cells.values())}
+    columns = np.concatenate([np.r_[at[name]] for name in problem.cells])
+    rooms = np.concatenate([np.full(len(c.parts), room[c.room]) for c in problem.cells.values()])
+    surface = np.concatenate([some.surface for some in problem.cells.values()])
+    order = np.lexsort([surface, rooms])
+    new = np.diff(rooms[order]) | np.diff(surface[order])
+    starts = np.append(0, np.flatnonzero(new) + 1)  # of each surface's
+    first = np.flatnonzero(np.diff(starts // CELLS_AT_ONCE, prepend=-1))
+    return np.split(columns[order], starts[first[1:]])
 
 
 def _join(at: Mapping[str, slice], names: Sequence[str]) -> np.ndarray:

@@ -184,9 +184,7 @@ def test_covariances_of_rows_over_any_unknowns_are_those_of_dense_rows(case, ord
     np.testing.assert_array_equal(kept, before[1])
 
 
-def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(
-    case, order, monkeypatch
-):
+def test_variances_of_sets_of_rows_are_the_diagonals_of_their_covariances(case, order, monkeypatch):
     """Of no set, of one, of several; also where not all rows are looked at at once."""
     linear = case.linear()
     kept = case.estimate(linear).covariance_of(list(linear.layout.outer()))
