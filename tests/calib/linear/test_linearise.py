@@ -62,16 +62,23 @@ def sizes(matrix):
     return np.where(size > 0, size, 1.0)
 
 
-def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, order):
-    gradients = Gradients(len(case.dense.sigma))
-    linear = case.linear(gradients=gradients)
+@pytest.fixture(scope="module")
+def eliminated(case):
+    """Dense rows over what is kept, and the right side; and how what is gone follows from these."""
     A, b = case.dense.some(in_linearisation(case))
     kept, gone = apart(case)
-    np.testing.assert_array_equal(linear.layout.kept, kept)
     rows = np.column_stack([A[:, kept], b])
     taken = np.linalg.lstsq(A[:, gone], rows, rcond=None)[0]
-    beyond = rows - A[:, gone] @ taken
-    size = sizes(rows.T @ rows)
+    return rows, rows - A[:, gone] @ taken, taken
+
+
+def test_what_is_kept_is_the_schur_complement_of_dense_rows(case, eliminated, order):
+    gradients = Gradients(len(case.dense.sigma))
+    linear = case.linear(gradients=gradients)
+    kept, gone = apart(case)
+    np.testing.assert_array_equal(linear.layout.kept, kept)
+    rows, beyond, taken = eliminated
+    b, size = rows[:, -1], sizes(rows.T @ rows)
     unit = np.outer(size, size)
     np.testing.assert_allclose(linear.kept / unit, beyond.T @ beyond / unit, atol=1e-9)
     each = np.repeat(*unknown_of(linear.layout))
