@@ -17,6 +17,9 @@ from calib.linear.system import Linearisation, Values
 from calib.problem.unknowns import Role
 from calib.residuals.compiled import add_at, add_sparse
 
+# Most entries of the rows of stops that wait, over all columns: bounds the memory.
+WAITING_ENTRIES = 2_000_000
+
 
 @dataclass(frozen=True)
 class KeptSums:
@@ -90,6 +93,9 @@ class Assembly(ABC):
         self.weight_m2 = self.beams_chi2 = 0.0
         self.eliminated: list[Eliminated] = []
         self.scans: dict[int, OwnSums] = {}
+        self.scanned: list[Scanned] = []  # which wait
+        widest = max(map(len, layout.own.values()), default=0) + 2 * TWIST
+        self.together = max(WAITING_ENTRIES // (widest * len(self.columns)), 1)
 
     def add(self, sums: StopSums) -> None:
         """Add the beams of a stop."""
@@ -119,11 +125,32 @@ class Assembly(ABC):
             chain=sums.chain * sigma[sums.chain_columns],
             columns=sums.chain_columns,
         )
-        self.add_twist(found)
+        self.scanned.append(found)
+        if len(self.scanned) >= self.together:
+            self._finish_scanned()
+
+    def _finish_scanned(self) -> None:
+        beams, self.scanned = self.scanned, []
+        if beams:
+            self.add_twists(beams)
 
     @abstractmethod
-    def add_twist(self, beams: Scanned) -> None:
-        """Add what a stop's beams say of where its LiDAR is."""
+    def add_twists(self, beams: Sequence[Scanned]) -> None:
+        """Add what the beams of stops say of where their LiDARs are."""
+
+    def add_through(self, T: np.ndarray, moved: np.ndarray, Z: np.ndarray) -> None:
+        """Add what twists say by what they depend on.
+
+        Args:
+            T: (K, 6, n) their derivatives by the first n of the others.
+            moved: (K, 6, n) the same, times the twists' information.
+            Z: (K, 6, N) that, and what twists have with all columns.
+        """
+        used, first = np.flatnonzero(T.any(axis=(0, 1))), len(self.cells)
+        chain = T.reshape(-1, T.shape[2])[:, used]
+        self.half[first + used] += chain.T @ Z.reshape(-1, Z.shape[2])
+        both = chain.T @ moved.reshape(-1, T.shape[2])[:, used]
+        self.half[np.ix_(first + used, first + used)] -= both / 2
 
     def add_kept(self, sums: KeptSums) -> None:
         """Add the sums of whitened rows of scatter within holds, which are about kept unknowns."""
@@ -136,6 +163,7 @@ class Assembly(ABC):
 
     def done(self, values: Values) -> Linearisation:
         """Eliminate all but the kept."""
+        self._finish_scanned()
         kept = self.eliminate(values)
         return Linearisation(
             layout=self.layout,

@@ -18,8 +18,6 @@ from calib.linear.own import OwnRows, alike
 from calib.linear.rows import TWIST
 from calib.linear.system import Values
 
-# Most entries of the rows of stops that wait, over all columns: bounds the memory.
-WAITING_ENTRIES = 2_000_000
 STOPS_TOGETHER = 64  # without beams, whose rows are multiplied at once: of 32 to 256 the fastest
 
 
@@ -31,17 +29,8 @@ class StopsFirst(Assembly):
         self.waiting = _waiting(layout, own)
         # What goes with stops' own unknowns, apart where it is asked what there was before.
         self.taken = np.zeros_like(self.half) if raw else self.half
-        self.scanned: list[Scanned] = []
-        widest = max(map(len, layout.own.values()), default=0) + 2 * TWIST
-        self.together = max(WAITING_ENTRIES // (widest * len(self.columns)), 1)
-
-    def add_twist(self, beams: Scanned) -> None:
-        self.scanned.append(beams)
-        if len(self.scanned) >= self.together:
-            self._finish_scanned()
 
     def eliminate(self, values: Values) -> np.ndarray:
-        self._finish_scanned()
         stops = list(self.waiting)
         if self.raw is not None:
             self.tell_raw()
@@ -52,27 +41,27 @@ class StopsFirst(Assembly):
 
     # ------------------------------------------------------------------------ stops with beams
 
-    def _finish_scanned(self) -> None:
-        """Add what the beams of the stops that wait say of where their LiDARs are, and the stops'
-        own rows; eliminate what is their own.
+    def add_twists(self, beams: Sequence[Scanned]) -> None:
+        """Add what the beams of stops say of where their LiDARs are, and the stops' own rows;
+        eliminate what is their own.
 
         With the twist ``t = T_o o + T_k k`` of own and kept unknowns, its information A and what it
         has with all others B, a stop adds ``T_k' Z + Z' T_k - T_k' A T_k`` to the others, where
         ``Z = A T_k + B``; its own have ``T_o' A T_o`` with each other and ``T_o' Z`` with the rest.
         """
-        beams, self.scanned = {each.stop: each for each in self.scanned}, []
+        by_stop = {each.stop: each for each in beams}
         kept = positions(self.layout.size, self.layout.kept)
-        for some in self._alike(list(beams)):
+        for some in self._alike(list(by_stop)):
             mine, at = self._columns(some[0])
             count, (rows, _) = len(self._own(some[0])), self._stacked(some, at, len(mine))
             others = self.at[mine[count:]]
-            A = np.stack([beams[stop].information for stop in some])
+            A = np.stack([by_stop[stop].information for stop in some])
             T_own = np.zeros((len(some), TWIST, count))
             T_kept = np.zeros((len(some), TWIST, len(self.layout.kept)))
             Z = np.zeros((len(some), TWIST, len(self.columns)))
             place = np.full(self.layout.size, -1)
             for i, stop in enumerate(some):
-                each = beams[stop]
+                each = by_stop[stop]
                 place[self._own(stop)] = np.arange(count)
                 here, there = place[each.columns], kept[each.columns]
                 T_own[i][:, here[here >= 0]] = each.chain[:, here >= 0]
@@ -82,7 +71,7 @@ class StopsFirst(Assembly):
                 self.waiting.pop(stop, None)
             moved = A @ T_kept
             Z[:, :, len(self.cells) : -1] += moved
-            self._add_through(T_kept, moved, Z)
+            self.add_through(T_kept, moved, Z)
             self._add_squares(rows[:, :, count:], others)
             if not count:
                 continue
@@ -109,7 +98,7 @@ class StopsFirst(Assembly):
         rows. Its rows are turned so that only six, the rank of a twist, touch more columns than R.
 
         Args:
-            factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `_finish_scanned`.
+            factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `add_twists`.
             rows: (K, m, o + r) own rows, of which the last r stand at `others` (r,).
         """
         count = factor.shape[1]
@@ -125,14 +114,6 @@ class StopsFirst(Assembly):
         gain = turned[:, :, :wide] @ W
         gain[:, :, others] += turned[:, :, wide:] @ beyond
         return gain
-
-    def _add_through(self, T: np.ndarray, moved: np.ndarray, Z: np.ndarray) -> None:
-        """Add what twists say by the kept unknowns (K, 6, S) they depend on."""
-        used, first = np.flatnonzero(T.any(axis=(0, 1))), len(self.cells)
-        chain = T.reshape(-1, T.shape[2])[:, used]
-        self.half[first + used] += chain.T @ Z.reshape(-1, Z.shape[2])
-        both = chain.T @ moved.reshape(-1, T.shape[2])[:, used]
-        self.half[np.ix_(first + used, first + used)] -= both / 2
 
     def _add_squares(self, rows: np.ndarray, at: np.ndarray) -> None:
         """Add the products of rows (K, m, n) over columns that stand at (n,)."""

@@ -6,7 +6,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from calib.linear import assembly
-from calib.linear.assembly import stops_first
+from calib.linear.assembly import common, stops_first
 from calib.linear.clusters import Gradients
 from calib.linear.parallel import workers
 
@@ -26,7 +26,7 @@ def eliminating(monkeypatch, order):
     """Cells before what stops have for themselves; or after it, so many stops at once."""
     monkeypatch.setattr(assembly, "begins_with_cells", lambda layout: order == "cells first")
     entries = TOGETHER.get(order, 1)
-    monkeypatch.setattr(stops_first, "WAITING_ENTRIES", entries)
+    monkeypatch.setattr(common, "WAITING_ENTRIES", entries)
     monkeypatch.setattr(stops_first, "STOPS_TOGETHER", min(entries, 256))
 
 
