@@ -243,7 +243,7 @@ def _tilts(problem: Problem) -> dict[tuple[object, str, int], dict[tuple[str, in
         if cells.axis is None:
             continue
         for k, (part, surface) in enumerate(zip(cells.parts, cells.surface, strict=True)):
-            one = regions[cells.room][surface] == 1
+            one = cells.column == SURFACE or regions[cells.room][surface] == 1
             of = (SURFACE, int(surface)) if one else (REGION_PART, int(part))
             found.setdefault((cells.room, *of), {})[name, k] = ABOUT_AXES[cells.axis]
     return found

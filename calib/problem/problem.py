@@ -77,6 +77,7 @@ class SurfaceCells:
         room: the mesh, or the recording whose planes these are.
         axis: along which they tilt, as of `calib.residuals.beams.Association.from_middle_m`; None
             where they stand off as a whole.
+        width_m: (P,) how wide those that tilt are along it.
     """
 
     column: str
@@ -85,6 +86,7 @@ class SurfaceCells:
     surface: np.ndarray
     room: int | str
     axis: int | None = None
+    width_m: np.ndarray | None = None
 
     @property
     def of_mesh(self) -> bool:

@@ -215,7 +215,7 @@ def _widened(problem: Problem, whose: Whose, sd: float) -> Problem:
     wider = replace(problem, scans=scans, aside=aside)
     sigma_m = sigmas(wider)[whose][0]
     cells = {
-        name: replace(known, sigma=np.full(known.dim, scatter(problem.cells[name], sigma_m)))
+        name: replace(known, sigma=scatter(problem.cells[name], sigma_m))
         for name, known in problem.variables.items()
         if name in problem.cells and problem.cells[name].kind == what
     }

@@ -48,18 +48,18 @@ class Association:
     Args:
         part: (N,) triangle or plane; -1 for nothing.
         patches: kind of patch -> (N,) patch of the surface, -1 for none; empty if not kept.
-        from_middle_m: (N, 2) where in its region each beam ends, along two axes of the surface;
-            None if not kept, and on planes.
+        from_middle_m: kind of part that may tilt -> (N, 2) how far from its middle each beam ends,
+            along two axes of the surface; empty if not kept.
     """
 
     part: np.ndarray
     patches: Mapping[str, np.ndarray] = field(default_factory=dict)
-    from_middle_m: np.ndarray | None = None
+    from_middle_m: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def only(self, some: np.ndarray) -> Association:
         """What some of the beams (n,) meet."""
         patches = {n: each[some] for n, each in self.patches.items()}
-        away_m = None if self.from_middle_m is None else self.from_middle_m[some]
+        away_m = {n: each[some] for n, each in self.from_middle_m.items()}
         return Association(self.part[some], patches, away_m)
 
 
@@ -100,9 +100,11 @@ class CellNumbers:
         Args:
             name: the unknown.
             part: (N,) the part of the kind that each beam meets; -1 for none.
-            association: what they meet, with where in their regions.
+            association: what they meet, with where in their parts.
         """
-        along = np.ones(len(part)) if self.axis is None else association.from_middle_m[:, self.axis]
+        along = np.ones(len(part))
+        if self.axis is not None:
+            along = association.from_middle_m[self.column][:, self.axis]
         return Columns(name, self.of_beams(part), along, self.components)
 
 

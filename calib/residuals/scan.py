@@ -86,8 +86,9 @@ class ScanStop:
         room: the mesh, or the recording whose planes these are.
         group: the name of its rows.
         cells: unknown of the surfaces -> which component moves what beams are known to meet.
-        reference_scatter_m: kind of part, "surface", "region" or "patch" -> how widely such parts
-            scatter beyond what is stated of them, which is in `reference_sigma_m`.
+        reference_scatter_m: kind of part, "surface", "region" or "patch", or "tilt" of whole
+            surfaces -> how widely they scatter beyond what is stated of them; in
+            `reference_sigma_m`.
     """
 
     name: str

@@ -45,7 +45,7 @@ class Meeting(Protocol):
 
     def surfaces(self, association: Association) -> np.ndarray: ...
 
-    def tilting(self, regions: np.ndarray) -> np.ndarray: ...
+    def tilting(self, kind: str, parts: np.ndarray) -> np.ndarray: ...
 
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association: ...
 
@@ -95,9 +95,17 @@ class MeshSurface:
             return parts
         return self.reference.patch_surface(self.patches_m[kind], kind == PATCH)[parts]
 
-    def tilting(self, regions: np.ndarray) -> np.ndarray:
-        """Which regions (R, 2) are wider than a patch, along each axis of their surface."""
-        return _wide(self, self.reference, regions)
+    def tilting(self, kind: str, parts: np.ndarray) -> np.ndarray:
+        """How wide (P, 2) parts are along each axis of their surface; 0 where they do not tilt:
+        regions as narrow as a patch, and surfaces as narrow as a region."""
+        surface = self.surface_of(kind, parts)
+        if kind == REGION_PART:
+            return _wide(self, self.reference, surface)
+        if kind == SURFACE:
+            whole_m = self.reference.widths_m(np.inf)
+            several = whole_m > self.reference.widths_m(self.patches_m[REGION_PART])
+            return np.where(several, whole_m, 0.0)[surface]
+        return np.zeros((len(parts), 2))
 
     def surfaces(self, association: Association) -> np.ndarray:
         """The surface (N,) that each beam meets, -1 for none."""
@@ -129,8 +137,11 @@ class MeshSurface:
         part = self._kept(T, beams, part)
         met = _Met(T, beams, self.reference.planes, part)
         patches = {kind: self._patch(met, kind).astype(np.int32) for kind in self.patches_m}
-        away_m = self.reference.from_middle_m(met.part, met.point_m, self.patches_m[REGION_PART])
-        return Association(part, patches, away_m.astype(np.float32))
+        away_m = {
+            kind: self.reference.from_middle_m(met.part, met.point_m, size_m).astype(np.float32)
+            for kind, size_m in ((SURFACE, np.inf), (REGION_PART, self.patches_m[REGION_PART]))
+        }
+        return Association(part, patches, away_m)
 
     def meet(
         self, T: np.ndarray, beams: Beams, values: Values, association: Association
@@ -211,12 +222,14 @@ class PlaneSurface:
         """The plane that each of those parts is of."""
         return self._grid.patch_surface(self.patches_m[kind])[parts]
 
-    def tilting(self, regions: np.ndarray) -> np.ndarray:
-        """Which regions (R, 2) are wider than a patch, along each axis of their plane. One that is
-        all of its plane tilts with it."""
+    def tilting(self, kind: str, parts: np.ndarray) -> np.ndarray:
+        """How wide (P, 2) regions are along each axis of their plane; 0 where they do not tilt, see
+        `MeshSurface.tilting`. One that is all of its plane tilts with it."""
+        if kind != REGION_PART:
+            return np.zeros((len(parts), 2))
+        surface = self.surface_of(kind, parts)
         several = self._grid.patches(self.patches_m[REGION_PART]) > 1
-        parts = several[self.surface_of(REGION_PART, regions)]
-        return _wide(self, self._grid, regions) & parts[:, None]
+        return np.where(several[surface, None], _wide(self, self._grid, surface), 0.0)
 
     def divided(self, T: np.ndarray, beams: Beams, part: np.ndarray) -> Association:
         """The planes (N,) that beams meet from there, and the patches of them."""
@@ -229,7 +242,7 @@ class PlaneSurface:
         where = met.part[hit], met.point_m[hit], self.patches_m[REGION_PART]
         away_m = np.zeros((len(part), 2), np.float32)
         away_m[hit] = self._grid.from_middle_m(*where)
-        return Association(part, patches, away_m)
+        return Association(part, patches, {REGION_PART: away_m})
 
     def associate(
         self, T: np.ndarray, beams: Beams, values: Values, near_edges: bool
@@ -365,11 +378,11 @@ def part_counts(reference: Reference) -> dict[str, int]:
 
 
 def _wide(
-    met: MeshSurface | PlaneSurface, grid: Reference | SurfaceGrid, regions: np.ndarray
+    met: MeshSurface | PlaneSurface, grid: Reference | SurfaceGrid, surface: np.ndarray
 ) -> np.ndarray:
-    """Which regions (R, 2) of a grid are wider than a patch, along each axis of their surface."""
+    """How wide (R, 2) regions of these surfaces are along each axis; 0 if as narrow as a patch."""
     widths_m = grid.widths_m(met.patches_m[REGION_PART])
-    return widths_m[met.surface_of(REGION_PART, regions)] > met.patches_m[PATCH]
+    return np.where(widths_m > met.patches_m[PATCH], widths_m, 0.0)[surface]
 
 
 def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str, float]:

@@ -108,8 +108,9 @@ def _computed(
         (len(root), len(ring))
     )  # what a unit of each moves the surface by, at its point
     for k, column in enumerate(rows.sparse):
-        if not ring[k] and (axis := scan.cells[column.variable].axis) is not None:
-            away_m[:, k] = met.from_middle_m[:, axis]
+        cells = None if ring[k] else scan.cells[column.variable]
+        if cells is not None and cells.axis is not None:
+            away_m[:, k] = met.from_middle_m[cells.column][:, cells.axis]
     for n in range(len(root)):
         beam = ray.origin_m[n], ray.direction[n], ray.range_m[n]
         plane = normal[n], normal[n] @ point[n]

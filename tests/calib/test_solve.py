@@ -62,7 +62,7 @@ class Dense:
         columns = {"origin": origin, "direction": direction, "range_m": range_m, "normal": normal}
         columns |= {"ring": read.ring, "point": a, "sigma": rows.sigma_m}
         columns |= {part: rows.view[part] for part in ("surface", "region", "patch")}
-        columns |= {"from_middle": association.from_middle_m}
+        columns |= {f"in_{part}": away_m for part, away_m in association.from_middle_m.items()}
         held = {name: column[kept] for name, column in columns.items()}
         return held | {"name": scan.name, "scale": rows.scale}
 
@@ -139,17 +139,22 @@ class Dense:
         off = np.zeros_like(along)
         for column in ("surface", "region", "patch"):
             name = f"0/reference_{column}"
-            if name in values:
-                dofs = self.estimate.problem.variables[name].dofs
-                parts = [int(dof.split("_")[-1]) for dof in dofs]
-                off += values[name][:, np.searchsorted(parts, stop[column])]
-            for axis, along_m in enumerate(stop["from_middle"].T if column == "region" else ()):
-                if (tilt := f"{name}.tilt_{axis}") in values:
-                    off += values[tilt][:, np.searchsorted(parts, stop[column])] * along_m
+            off += self._of_part(name, stop[column], values)
+            for axis, along_m in enumerate(stop.get(f"in_{column}", np.zeros((0, 0))).T):
+                off += self._of_part(f"{name}.tilt_{axis}", stop[column], values) * along_m
         # A surface that stands off does so towards the sensor.
         wall = np.einsum("ki,ki->k", stop["normal"], stop["point"]) - off * np.sign(along)
         true_m = (wall - start) / along
         return (stop["range_m"] - self.hardware.ring_m[:, stop["ring"]] - true_m) / stop["sigma"]
+
+    def _of_part(self, name, part, values):
+        """(N, n) what an unknown of surfaces adds to the parts (n,) that beams meet."""
+        if name not in values:
+            return 0.0
+        dofs = self.estimate.problem.variables[name].dofs
+        of = {int(dof.split("_")[-1]): i for i, dof in enumerate(dofs)}
+        at = np.array([of.get(int(p), len(dofs)) for p in part])
+        return np.pad(values[name], ((0, 0), (0, 1)))[:, at]
 
     def _bodies(self, values):
         tracker, recording = self.source.rig.tracker, self.source.recording

@@ -29,6 +29,7 @@ from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.problem import Problem
 from calib.problem.spread import SpreadName, Whose, by_chance, rows_at, sigmas, spread_keys
+from calib.problem.surfaces import TILT
 from calib.residuals.groups import Group
 from calib.results.holdout import fall_document
 from calib.results.solution import one_unit
@@ -50,6 +51,7 @@ NOUNS = {
     Site.TARGET: "Targets scatter",
     Site.REFERENCE: "The mesh scatters",
 }
+WHO = {TILT: "the ends of leaning surfaces"}  # what scatters, where its key alone says too little
 
 
 @dataclass(frozen=True)
@@ -195,7 +197,8 @@ class Chance:
             sizes: dict[str, list[str]] = {}
             for spread in (s for s in self.spreads if s.sd > s.sigma):
                 sizes.setdefault(spread.who, []).append(spread.told)
-            told = ", ".join(f"{of} by {' and '.join(some)}" for of, some in sizes.items())
+            each_of = (f"{WHO.get(of, of)} by {' and '.join(some)}" for of, some in sizes.items())
+            told = ", ".join(each_of)
             what = f"{NOUNS[self.effect.site]} more than rig.yaml says: beyond its sigma, {told}"
         else:
             told = [s.told for s in self.spreads if s.sd > s.sigma] or [self.spreads[0].told]

@@ -14,7 +14,7 @@ from .. import rigs, simulated
 
 NO_NOISE = {"urdf": "arm.urdf", "base": "arm_base", "tip": "arm_end", "sigma_joint_rad": 0}
 CELLS = ("0/reference_surface", "0/reference_region", "0/reference_patch")
-TILTS = ("0/reference_region.tilt_0", "0/reference_region.tilt_1")
+TILTS = tuple(f"0/reference_{part}.tilt_{k}" for part in ("surface", "region") for k in (0, 1))
 JOINTS = tuple(f"joints@s{k}" for k in range(4))
 
 
