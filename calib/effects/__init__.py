@@ -81,7 +81,15 @@ from calib.effects.range import (
     TemperatureDrift,
     WarmupDrift,
 )
-from calib.effects.reference import FaroScale, MeshSeamX, MeshSeamY, MeshShift, MovedSurface
+from calib.effects.reference import (
+    FaroScale,
+    MeshScale,
+    MeshSeamX,
+    MeshSeamY,
+    MeshShift,
+    MeshStrain,
+    MovedSurface,
+)
 from calib.effects.rig import (
     FrameOffset,
     LidarSlip,
@@ -185,6 +193,8 @@ CATALOGUE: tuple[Effect, ...] = (
     TargetSphereOffset(),
     FaroScale(),
     MeshShift(),
+    MeshScale(),
+    MeshStrain(),
     MeshSeamX(),
     MeshSeamY(),
     MovedSurface(),

@@ -74,6 +74,46 @@ class MeshShift(Effect):
         return basis
 
 
+class MeshScale(MeshShift):
+    """The mesh has another metre than the spheres: it was scaled on its way, or made of other scans
+    than they."""
+
+    name = "mesh_scale"
+    unit = "1"
+    formula = "surface = mesh * (1 + s), about the origin of the reference's frame"
+    typical = "100 to 2000 ppm of a mesh that was merged or exported badly, size assumed"
+    confounded_with = ("faro_scale", "range_scale", "mesh_strain")
+    twin = ""
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        apart = super().params(rig) and rig.reference.mesh
+        return (Param("scale", "1", 0.0005),) if apart else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        return finite(view["point_m"])[:, :, None]
+
+
+class MeshStrain(MeshScale):
+    """The mesh is stretched along one axis, or sheared, and not in the frame of the spheres: scans
+    of parts of the room were joined with small errors that add up."""
+
+    name = "mesh_strain"
+    unit = "m, 1"
+    formula = "surface = mesh + t + F point, about the origin of the reference's frame"
+    confounded_with = ("mesh_scale", "mesh_shift", "mesh_seam_x", "mesh_seam_y")
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        rates = (Param(f"{a}{b}", "1", 0.0005) for a in "xyz" for b in "xyz")
+        return (*RIGID[:3], *rates) if super().params(rig) else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        point_m = finite(view["point_m"])
+        basis = np.zeros((len(point_m), 3, 12))
+        for a in range(3):
+            basis[:, a, a], basis[:, a, 3 + 3 * a : 6 + 3 * a] = 1.0, point_m
+        return basis
+
+
 class MeshSeamX(MeshShift):
     """Scans of the room were registered wrongly: beyond a seam across x the mesh is shifted and
     turned against the rest of it."""

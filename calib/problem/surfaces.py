@@ -25,14 +25,14 @@ from calib.residuals.surfaces import PLANE_PATCHES_M, Meeting, PlaneSurface
 LEAST_BEAMS = 100  # on a plane: three numbers of it, known ten times better than by a single beam
 LOST_BEAMS = 0.5  # of these, below which a plane that was found has lost its beams
 TILT = "tilt"  # of whole surfaces: by how much they lean from end to end, m
-# Variances as shares of the reference's: of how far parts of a surface stand off, and of by how much
-# a whole surface leans; and by how much regions tilt, rad, for each metre that they stand off.
-# Chosen by how far errors smooth over 0.4, 1 and 2 m turn the mesh of a lab, in its sigmas: 0.8, 1.0
-# and 1.3; without tilts, and with shares of 0.6, 0.6 and 2, by 1.3, 1.4 and 1.7. Over 24 labs of 24
-# stops rotations were 0.98 of their sigmas off (rms), and 1.30 without tilts of regions; ring zeros
-# of an XT32, over 12, 1.17 and 1.40. What is no wider than a patch has no tilt of its own. That whole
-# surfaces lean hardly changes this (0.89 and 0.92 over 8 labs); without it a floor that leans by 1
-# mrad turned the room by 6 to 7 of its sigmas.
+# Variances as shares of the reference's: of how far parts of a surface stand off, and of by how
+# much a whole surface leans; and by how much regions tilt, rad, for each metre that they stand off.
+# Chosen by how far errors smooth over 0.4, 1 and 2 m turn the mesh of a lab, in its sigmas: 0.8,
+# 1.0 and 1.3; without tilts, and with shares of 0.6, 0.6 and 2, by 1.3, 1.4 and 1.7. Over 24 labs
+# of 24 stops rotations were 0.98 of their sigmas off (rms), and 1.30 without tilts of regions; ring
+# zeros of an XT32, over 12, 1.17 and 1.40. What is no wider than a patch has no tilt of its own.
+# That whole surfaces lean hardly changes this (0.89 and 0.92 over 8 labs); without it a floor that
+# leans by 1 mrad turned the room by 6 to 7 of its sigmas.
 SURFACE_SHARES = {SURFACE: 0.6, REGION_PART: 1.0, PATCH: 0.5, TILT: 0.6}
 TILT_PER_M = np.sqrt(2.0)
 

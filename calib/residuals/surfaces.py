@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import Any, ClassVar, Protocol
+from functools import cache, cached_property, partial
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -99,13 +98,12 @@ class MeshSurface:
         """How wide (P, 2) parts are along each axis of their surface; 0 where they do not tilt:
         regions as narrow as a patch, and surfaces as narrow as a region."""
         surface = self.surface_of(kind, parts)
-        if kind == REGION_PART:
-            return _wide(self, self.reference, surface)
         if kind == SURFACE:
             whole_m = self.reference.widths_m(np.inf)
             several = whole_m > self.reference.widths_m(self.patches_m[REGION_PART])
             return np.where(several, whole_m, 0.0)[surface]
-        return np.zeros((len(parts), 2))
+        wide_m = _wide(self, self.reference, surface)
+        return wide_m if kind == REGION_PART else np.zeros_like(wide_m)
 
     def surfaces(self, association: Association) -> np.ndarray:
         """The surface (N,) that each beam meets, -1 for none."""
@@ -148,7 +146,7 @@ class MeshSurface:
     ) -> Surface:
         """The triangle's plane that each beam meets under this association."""
         met = _Met(T, beams, self.reference.planes, association.part)
-        facts = _once(lambda: self.reference.facts(met.part))
+        facts = cache(lambda: self.reference.facts(met.part))
         columns = met.columns | {
             "label": lambda: facts()[0],
             "reference_intensity": lambda: facts()[1],
@@ -335,7 +333,7 @@ class _Met:
         return {
             "normal": lambda: self.normal,
             "point_m": lambda: self.point_m,
-            "incidence_rad": _once(lambda: np.arccos(self.cosine)),
+            "incidence_rad": cache(lambda: np.arccos(self.cosine)),
         }
 
     def surface(
@@ -396,11 +394,6 @@ def _widths_m(patches_m: Mapping[str, float], points_m: np.ndarray) -> dict[str,
 def _and_none(normal: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
     """Planes (M + 1, 4), the last met by no beam."""
     return np.vstack([np.column_stack([normal, distance_m]), [[0.0, 0.0, 0.0, np.inf]]])
-
-
-def _once(compute: Callable[[], Any]) -> Callable[[], Any]:
-    """The function, computing once."""
-    return functools.cache(compute)
 
 
 def _in_reference(T: np.ndarray, beams: Beams) -> tuple[np.ndarray, np.ndarray]:

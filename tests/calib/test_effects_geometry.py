@@ -299,6 +299,24 @@ def test_the_mesh_is_moved_as_a_rigid_body_and_the_spheres_are_not(source):
     assert not effect.of_scanner and find("faro_scale").of_scanner
 
 
+def test_the_mesh_alone_is_strained_as_by_any_affine_map(source):
+    rng = np.random.default_rng(0)
+    point_m, shift_m, rates = rng.normal(size=(6, 3)), rng.normal(size=3), rng.normal(size=(3, 3))
+    view = View(source.rig, 6, {"point_m": point_m}, np.zeros((1, 6)))
+    strain, scale = find("mesh_strain"), find("mesh_scale")
+    names = [param.name for param in strain.params(source.rig)]
+    given = dict(zip(("tx", "ty", "tz"), shift_m, strict=True))
+    given |= {f"{a}{b}": rates[i, j] for i, a in enumerate("xyz") for j, b in enumerate("xyz")}
+    found = strain.basis(view) @ [given[name] for name in names]
+    np.testing.assert_allclose(found, point_m @ rates.T + shift_m)
+    np.testing.assert_allclose(scale.basis(view) @ [1e-3], 1e-3 * point_m)
+    for effect in (strain, scale):
+        assert not effect.of_scanner and not effect.twin
+        no_mesh = replace(source.rig, reference=replace(source.rig.reference, mesh=None))
+        no_targets = replace(source.rig, target=None)
+        assert not effect.params(no_mesh) and not effect.params(no_targets)
+
+
 @pytest.mark.parametrize("name", ["mesh_seam_x", "mesh_seam_y"])
 def test_the_mesh_is_moved_beyond_a_seam_alone(source, name):
     effect = find(name).at(0.5)
