@@ -19,7 +19,7 @@ from calib.diagnosis.carried import Carried
 from calib.diagnosis.chance import Chance, chances, of_lidar, ranked, rows_by_chance
 from calib.diagnosis.chance.agreeing import agreements
 from calib.diagnosis.chance.beams import BeamScatter
-from calib.diagnosis.chance.serial import p_serial
+from calib.diagnosis.chance.serial import p_of_pose, p_serial
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, beams_looked_at, linearise_with, rows_along
 from calib.diagnosis.score import ScoreTest, away_from_model, project
@@ -276,6 +276,7 @@ class Look:
             replace(
                 c,
                 p_serial=p_serial(c.effect, self.others, self.blunders),
+                p_of_pose=p_of_pose(c.effect, self.others, self.blunders),
                 agreements=agreements(c.effect, self.stand.estimate, self.others, self.blunders),
             )
             for c in beside

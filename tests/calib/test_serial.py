@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from calib.diagnosis.chance.serial import FEWEST_IN_SERIES, drifting, p_serial
+from calib.diagnosis.chance.serial import FEWEST_PAIRS, drifting, p_of_pose, p_serial
 from calib.diagnosis.search import search
 from calib.effects import find
 from calib.runs.calibrate import calibrate
@@ -25,12 +25,13 @@ def quiet(*told):
     """Nothing."""
 
 
-def of_a_body(errors, time_s=None, turn=None):
+def of_a_body(errors, time_s=None, turn=None, joints=None):
     """A problem and its blunders: errors (K, r) of a body at the stops of a table, with the times
-    of these; and what turns (K, r, r) the rows' own axes to theirs."""
+    of these; what turns (K, r, r) the rows' own axes to theirs; and how joints (K, J) stood."""
     stops = STOPS[: len(errors)]
     time_s = np.full(len(stops), np.nan) if time_s is None else time_s  # as of no times
-    recording = SimpleNamespace(stops=stops, time_s=time_s)
+    joints = np.zeros((len(stops), 0)) if joints is None else joints
+    recording = SimpleNamespace(stops=stops, time_s=time_s, joints=joints)
     problem = SimpleNamespace(sources=[SimpleNamespace(recording=recording)])
     known = 2.0 * np.eye(errors.shape[1])
     blunders = [
@@ -98,11 +99,32 @@ def test_what_is_fixed_to_a_body_and_what_is_fixed_to_the_tracker_are_seen():
 
 
 def test_few_stops_and_other_instruments_tell_nothing():
-    drift = np.arange(FEWEST_IN_SERIES - 1.0)[:, None] - 4.0
+    drift = np.arange(float(FEWEST_PAIRS))[:, None] - 4.0
     assert told(drift) == 1.0
     drift = np.arange(30.0)[:, None] - 14.5
     assert told(drift) < 0.01
     assert told(drift, effect="target_scatter") == 1.0
+
+
+def of_pose(errors, joints):
+    """How often chance makes errors (K, r) so much alike where joints (K, J) stand alike."""
+    problem, blunders = of_a_body(errors, joints=joints)
+    return p_of_pose(find("tracker_scatter"), SimpleNamespace(problem=problem), blunders)
+
+
+def test_errors_that_go_with_the_pose_are_alike_where_the_arm_stands_again():
+    """Five poses at each of six places, reached to a tenth of a milliradian, and one joint unread
+    at a stop; errors of which half go with the pose. Where none do, they seldom seem to."""
+    rng = np.random.default_rng(4)
+    poses = np.tile(rng.uniform(-2, 2, (5, 6)), (6, 1)) + 1e-4 * rng.normal(size=(30, 6))
+    poses[7, 2] = np.nan
+    with_it = np.tile(rng.normal(size=(5, 3)), (6, 1)) + rng.normal(size=(30, 3))
+    assert of_pose(with_it, poses) < 0.01
+    assert of_pose(with_it, rng.permutation(poses)) > 0.01
+    assert of_pose(with_it, rng.uniform(-2, 2, (30, 6))) == 1.0  # no pose was taken twice
+    p = np.array([of_pose(rng.normal(size=(30, 3)), poses) for _ in range(2000)])
+    assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.015)
+    assert np.mean(p < 0.5) == pytest.approx(0.5, abs=0.03)
 
 
 def test_values_of_stops_are_taken_as_the_stops_were_made():
@@ -116,6 +138,7 @@ def test_values_of_stops_are_taken_as_the_stops_were_made():
                     folder=Path(day),
                     stops=[STOPS[k] for k in order],
                     time_s=60.0 * order,
+                    joints=np.zeros((30, 0)),
                 )
             )
             for day in ("mon", "tue")

@@ -24,7 +24,7 @@ from calib.blunders.others import Others
 from calib.blunders.shifts import beside_bodies, of_poses, told_by_stop
 from calib.diagnosis.chance.agreeing import Agreement
 from calib.diagnosis.chance.at_zero import AtZero
-from calib.diagnosis.chance.serial import ALPHA_SERIAL
+from calib.diagnosis.chance.serial import random_or_not
 from calib.diagnosis.score import Scores
 from calib.effects import CATALOGUE, Scatter, Site
 from calib.problem import Problem
@@ -95,6 +95,7 @@ class Chance:
         detectable: spread that is found with 80 % power, in the effect's leading unit.
         rivals: names of others that explain as much.
         p_serial: how often chance makes stops that follow each other err so much alike.
+        p_of_pose: the same of stops in which the arm has the same pose.
         agreements: by recording or body, of most stops, where only some are off.
     """
 
@@ -105,6 +106,7 @@ class Chance:
     detectable: float
     rivals: Sequence[str] = ()
     p_serial: float = 1.0
+    p_of_pose: float = 1.0
     agreements: Sequence[Agreement | None] = ()
 
     @property
@@ -155,6 +157,7 @@ class Chance:
             "p_value": at_least(self.p_value),
             "p_adjusted": self.p_adjusted,
             "p_serial": at_least(self.p_serial),
+            "p_of_pose": at_least(self.p_of_pose),
             "statistic": self.statistic,
             "dof": len(self.spreads),
             "step": step,
@@ -205,13 +208,7 @@ class Chance:
             told = " and ".join(told)
             what = f"{each.capitalize()}s scatter by {told} {self.effect.what}"
         rivals = f"On these data it is not distinguishable from {', '.join(self.rivals)}. "
-        how = f"random as far as these data show (p = {self.p_adjusted:.1g})"
-        if self.p_serial < ALPHA_SERIAL:
-            how = (
-                "not at random, as stops that follow each other err alike (p = "
-                f"{at_least(self.p_serial):.1g}): something drifts, was changed in between, or "
-                "goes with the pose where poses follow a path"
-            )
+        how = random_or_not(self.p_adjusted, self.p_serial, self.p_of_pose)
         return (
             f"{what}; {how}. {rivals if self.rivals else ''}"
             f"{name} widens every sigma by that; it predicts nothing at another {each}, so the "

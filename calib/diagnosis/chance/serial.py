@@ -1,17 +1,19 @@
-"""Serial correlation of what seems to scatter from stop to stop: whether stops that follow each
-other err alike, as where something drifts, or was changed in between and changed back.
+"""Correlation of what seems to scatter from stop to stop: whether stops that follow each other err
+alike, as where something drifts, or was changed in between and changed back; and whether those do
+in which the arm has the same pose, as where the error goes with it.
 
-With r_k the errors of the k-th stop in time, ``S = sum r_k . r_(k+1)``. Where errors are random,
-each might as well have the other sign, and then S has the mean 0 and the variance ``sum (r_k .
-r_(k+1))^2``, however widely any of them scatters (the serial correlation of von Neumann 1941, by
-signs as in `jackknife`). Errors are taken against a fit of all other rows, which leaves next to
+With r_k the errors of stops, ``S = sum r_i . r_k`` over pairs of these. Where errors are random,
+each might as well have the other sign, and then S has the mean 0 and the variance ``sum (r_i .
+r_k)^2``, however widely any of them scatters (the serial correlation of von Neumann 1941, by signs
+as in `jackknife`). Errors are taken against a fit of all other rows, which leaves next to
 nothing in common between those of neighbours. What is fixed to a body keeps its direction in the
 body's axes, and what is fixed to the tracker keeps it in the tracker's: both are asked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy import special
@@ -26,8 +28,15 @@ from calib.problem.model import labels
 from sensors.stops import in_time
 
 ALPHA_SERIAL = 0.01  # share of random errors that are said not to be: a choice, it names nothing
-FEWEST_IN_SERIES = 10  # stops: S over its sd is at most the root of their number, 3 for p = 0.001
+FEWEST_PAIRS = 9  # of stops: S over its sd is at most the root of their number, 3 for p = 0.001
+SAME_POSE = (
+    0.01  # rad or m, of each joint: poses that are driven to again are nearer, others hardly
+)
 OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
+
+
+StopKey = tuple[str, str]  # recording and stop
+Pairs = Callable[[Sequence[StopKey]], np.ndarray]  # (P, 2) of some stops
 
 
 def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
@@ -38,25 +47,65 @@ def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
         others: all rows of the fit of that model.
         blunders: all groups of them, as `judge` has them.
     """
+    return _least(_series(effect, others, blunders), _in_time(others.problem))
+
+
+def p_of_pose(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
+    """The same of stops in which the arm has the same pose."""
+    return _least(_series(effect, others, blunders), _in_pose(others.problem))
+
+
+def _series(
+    effect: Scatter, others: Others, blunders: list[Blunder]
+) -> Iterator[tuple[list[StopKey], np.ndarray]]:
+    """Stops, and their errors (K, r), of which some may be alike."""
     if effect.widens:
-        return _p_of_rows(others.problem, OF_ROWS.get(effect.site, ""), blunders)
-    turn = _turns(others.problem)
-    return _least(_of_values(effect, others, turn)) if effect.per == "stop" else 1.0
+        return _of_rows(OF_ROWS.get(effect.site, ""), blunders)
+    return _of_values(effect, others) if effect.per == "stop" else iter(())
 
 
-def _turns(problem: Problem) -> dict[tuple[str, str], int]:
-    """Recording and stop -> its place in the order of time."""
-    named = zip(problem.sources, labels(problem.sources), strict=True)
-    return {
+def _in_time(problem: Problem) -> Pairs:
+    """Pairs of stops that follow each other."""
+    turn = {
         (of, stop): at
-        for source, of in named
+        for source, of in zip(problem.sources, labels(problem.sources), strict=True)
         for at, stop in enumerate(in_time(source.recording.stops, source.recording.time_s))
     }
 
+    def pairs(stops: Sequence[StopKey]) -> np.ndarray:
+        there = [k for k, stop in enumerate(stops) if stop in turn]
+        order = sorted(there, key=lambda k: turn[stops[k]])
+        return np.array([order[:-1], order[1:]], int).T
 
-def _least(series: Iterator[np.ndarray]) -> float:
+    return pairs
+
+
+def _in_pose(problem: Problem) -> Pairs:
+    """Pairs of stops of a recording in which all its joints are read, and alike: each with the next
+    of its pose, so that signs of no two products depend on each other."""
+    poses: dict[StopKey, tuple[str, ...]] = {}
+    for source, of in zip(problem.sources, labels(problem.sources), strict=True):
+        joints = source.recording.joints
+        read = np.flatnonzero(np.isfinite(joints).all(axis=1)) if joints.size else ()
+        for k in read:
+            near = np.round(joints[k] / SAME_POSE).astype(int)
+            poses[of, source.recording.stops[k]] = (of, *map(str, near.tolist()))
+
+    def pairs(stops: Sequence[StopKey]) -> np.ndarray:
+        alike: dict[tuple[str, ...], list[int]] = {}
+        for k, stop in enumerate(stops):
+            if stop in poses:
+                alike.setdefault(poses[stop], []).append(k)
+        found = [pair for some in alike.values() for pair in pairwise(some)]
+        return np.array(found, int).reshape(-1, 2)
+
+    return pairs
+
+
+def _least(series: Iterable[tuple[list[StopKey], np.ndarray]], pairs: Pairs) -> float:
     """The least p-value of some series, how many there are being paid for."""
-    p = [_alike(errors) for errors in series if len(errors) >= FEWEST_IN_SERIES]
+    each = ((errors, pairs(stops)) for stops, errors in series)
+    p = [_alike(errors, some) for errors, some in each if len(some) >= FEWEST_PAIRS]
     return min(1.0, len(p) * min(p)) if p else 1.0
 
 
@@ -69,7 +118,7 @@ def drifting(problem: Problem, blunders: list[Blunder], names: Sequence[str]) ->
         blunders: of its rows, as `judge` has them.
         names: of effects that go with time and were found; a step, say.
     """
-    p = _p_of_rows(problem, "body", blunders)
+    p = _least(_of_rows("body", blunders), _in_time(problem))
     if p < ALPHA_SERIAL:
         looks = all_of(names)
         beside, mistaken = "", ""
@@ -84,47 +133,53 @@ def drifting(problem: Problem, blunders: list[Blunder], names: Sequence[str]) ->
         )
 
 
-def _p_of_rows(problem: Problem, kind: str, blunders: list[Blunder]) -> float:
-    return _least(_of_rows(kind, blunders, _turns(problem)))
+def random_or_not(p_adjusted: float, p_serial: float, p_of_pose: float) -> str:
+    """Whether scatter that was found is random, in words."""
+    if min(p_serial, p_of_pose) >= ALPHA_SERIAL:
+        return f"random as far as these data show (p = {p_adjusted:.1g})"
+    if p_of_pose < p_serial:
+        return (
+            "not at random, as stops in which the arm has the same pose err alike (p = "
+            f"{at_least(p_of_pose):.1g}): the error goes with the pose"
+        )
+    return (
+        f"not at random, as stops that follow each other err alike (p = {at_least(p_serial):.1g}): "
+        "something drifts, was changed in between, or goes with the pose where poses follow a path"
+    )
 
 
-def _of_rows(
-    kind: str, blunders: list[Blunder], turn: dict[tuple[str, str], int]
-) -> Iterator[np.ndarray]:
-    """Errors (K, r) of each body, or each joint, in its sigmas, in the order of time; of bodies in
-    the axes in which people are told, and in those of the rows."""
-    found: dict[tuple[str, str, int, bool], list[tuple[int, np.ndarray]]] = {}
+def _of_rows(kind: str, blunders: list[Blunder]) -> Iterator[tuple[list[StopKey], np.ndarray]]:
+    """Errors (K, r) of each body, or each joint, in its sigmas, and the stops of these; of bodies
+    in the axes in which people are told, and in those of the rows."""
+    found: dict[tuple[str, str, int, bool], list[tuple[StopKey, np.ndarray]]] = {}
     for shift in (b.shift for b in blunders if b.group.kind == kind and not b.found):
-        at = turn.get((shift.group.recording, shift.group.where))
-        if at is not None and shift.dof == len(shift.offset):
+        if shift.dof == len(shift.offset):
             for R in (None,) if shift.turn is None else (None, shift.turn):
                 offset, C = shift.offset, shift.covariance
                 if R is not None:
                     offset, C = R.T @ offset, R.T @ C @ R
                 key = shift.group.recording, shift.group.what, shift.dof, R is None
-                found.setdefault(key, []).append((at, offset / np.sqrt(np.diag(C))))
+                stop = shift.group.recording, shift.group.where
+                found.setdefault(key, []).append((stop, offset / np.sqrt(np.diag(C))))
     for some in found.values():
-        yield np.stack([error for _, error in sorted(some, key=lambda each: each[0])])
+        yield [stop for stop, _ in some], np.stack([error for _, error in some])
 
 
-def _of_values(
-    effect: Scatter, others: Others, turn: dict[tuple[str, str], int]
-) -> Iterator[np.ndarray]:
-    """Values (K, r) of the stops of each recording, in their spreads, in the order of time."""
-    named = zip(others.problem.terms, labels(others.problem.sources), strict=True)
-    for term, label in ((t, label) for some, label in named for t in some):
+def _of_values(effect: Scatter, others: Others) -> Iterator[tuple[list[StopKey], np.ndarray]]:
+    """Values (K, r) of the stops of each recording, in their spreads, and these stops."""
+    problem = others.problem
+    named = zip(problem.terms, problem.sources, labels(problem.sources), strict=True)
+    for term, source, of in ((t, s, label) for some, s, label in named for t in some):
         if term.effect.name == effect.name:
-            known = {
-                f"{term.effect.label}{stop}": at for (of, stop), at in turn.items() if of == label
-            }
-            sd = others.problem.variables[term.variable].sigma
-            values = (others.whole.values[term.variable] / sd).reshape(len(term.effect.members), -1)
-            mine = [k for k, member in enumerate(term.effect.members) if member in known]
-            yield values[sorted(mine, key=lambda k: known[term.effect.members[k]])]
+            known = {f"{term.effect.label}{stop}": (of, stop) for stop in source.recording.stops}
+            sd, members = problem.variables[term.variable].sigma, term.effect.members
+            values = (others.whole.values[term.variable] / sd).reshape(len(members), -1)
+            mine = [k for k, member in enumerate(members) if member in known]
+            yield [known[members[k]] for k in mine], values[mine]
 
 
-def _alike(errors: np.ndarray) -> float:
-    """One-sided p-value of S for errors (K, r) in the order of time."""
-    products = np.einsum("ki,ki->k", errors[:-1], errors[1:])
+def _alike(errors: np.ndarray, pairs: np.ndarray) -> float:
+    """One-sided p-value of S for errors (K, r) of pairs (P, 2)."""
+    products = np.einsum("ki,ki->k", errors[pairs[:, 0]], errors[pairs[:, 1]])
     sd = float(np.sqrt(np.square(products).sum()))
     return float(special.ndtr(-products.sum() / max(sd, 1e-300)))

@@ -261,7 +261,7 @@ def _drifts(found: Search, unexplained: Sequence[Mapping[str, Any]]) -> Iterator
     last = found.beside or found.looks[-1]
     names = [step.effect.name for step in found.found if step.effect.goes_with_time]
     of_time = {c for each in unexplained for c in each["covariates"]} <= OF_TIME
-    told = any(each.p_serial < ALPHA_SERIAL for each in found.chance)
+    told = any(min(c.p_serial, c.p_of_pose) < ALPHA_SERIAL for c in found.chance)
     if not last.stand.estimate.converged or told or not (names or of_time):
         return iter(())
     return drifting(last.stand.estimate.problem, last.blunders, names)
