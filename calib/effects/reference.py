@@ -75,7 +75,7 @@ class MeshShift(Effect):
 
 
 class MeshScale(MeshShift):
-    """The mesh has another metre than the spheres: it was scaled on its way, or made of other scans
+    """The mesh has another metre than the spheres. It was scaled on its way, or made of other scans
     than they."""
 
     name = "mesh_scale"
@@ -94,8 +94,8 @@ class MeshScale(MeshShift):
 
 
 class MeshStrain(MeshScale):
-    """The mesh is stretched along one axis, or sheared, and not in the frame of the spheres: scans
-    of parts of the room were joined with small errors that add up."""
+    """The mesh is stretched along an axis, or sheared. Scans of parts of the room were joined with
+    small errors that add up, and are not in the frame of the spheres."""
 
     name = "mesh_strain"
     unit = "m, 1"

@@ -273,24 +273,34 @@ def test_priors_of_patches_are_with_their_region_and_each_target_is_a_cluster(fi
     assert targets == [9] * len(fitted.problem.sources[0].recording.targets.names)
 
 
-def test_what_is_no_wider_than_a_patch_has_no_tilt(fitted):
+def test_what_is_no_wider_than_a_patch_has_no_tilt_and_what_is_a_region_does_not_lean(fitted):
     """By the extent of each surface's corners along their principal axes."""
     mesh, cells = fitted.scans[0].meeting.reference, fitted.problem.cells.values()
-    tilted = [set(each.surface.tolist()) for each in cells if each.axis is not None]
-    (met,) = (each.surface for each in cells if each.column == "surface")
-    small = large = 0
+    tilted = {
+        part: [set(each.surface.tolist()) for each in cells if (each.column, each.axis) in axes]
+        for part in ("surface", "region")
+        for axes in [{(part, 0), (part, 1)}]
+    }
+    (met,) = (c.surface for c in cells if c.column == "surface" and c.axis is None)
+    region_m = fitted.scans[0].meeting.patches_m["region"]
+    small = large = leaning = 0
     for surface in met.tolist():
         corners_m = mesh.vertices_m[mesh.triangles[mesh.surface == surface]].reshape(-1, 3)
         away_m = corners_m - corners_m.mean(axis=0)
         long_m, wide_m, _ = np.ptp(away_m @ np.linalg.svd(away_m)[2].T, axis=0)
-        tilts = [surface in some for some in tilted]
+        tilts = [surface in some for some in tilted["region"]]
         if long_m < 0.45:
             small += 1
             assert not any(tilts)
         elif wide_m > 0.75:
             large += 1
             assert all(tilts)
-    assert len(tilted) == 2 and small > 1 and large > 5
+        leans = [surface in some for some in tilted["surface"]]
+        assert not any(leans) if long_m < region_m else True
+        assert all(leans) if wide_m > 2.0 * region_m else True
+        leaning += all(leans)
+    assert len(tilted["region"]) == len(tilted["surface"]) == 2
+    assert small > 1 and large > 5 and 1 < leaning < large
 
 
 def test_a_ring_without_returns_is_as_well_known_as_before(tmp_path):

@@ -118,10 +118,10 @@ class Groups:
             )
 
     def _tilted(self, rows: np.ndarray, name: str, cells: object) -> None:
-        """Tilts are with their region, or with the surface that is that region alone."""
+        """Tilts are with their region or surface; or with the surface that is that region alone."""
         sigma = self.problem.variables[name].sigma
         for k, row in enumerate(rows):
-            region = Group("surface", "mesh", f"region_{cells.parts[k]}")
+            region = Group("surface", "mesh", f"{cells.column}_{cells.parts[k]}")
             surface = Group("surface", "mesh", f"surface_{cells.surface[k]}")
             group = region if region in self.parts else surface
             found = self.parts[group]
