@@ -37,7 +37,7 @@ BOXES = {  # changes of rig.yaml
 }
 SIMULATED = {
     "simulated": Spec(lidar="hesai_pandarxt32", locations=2, stops_per_location=2, column_step=128),
-    "planes": Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=100),
+    "planes": Spec(mesh=False, targets=0, locations=3, stops_per_location=2, column_step=200),
 }
 CASES = (*BOXES, *SIMULATED, "a stop without scan", "two recordings", "an earlier estimate")
 
