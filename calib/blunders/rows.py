@@ -234,8 +234,8 @@ def _mesh(whole: Linearisation, problem: Problem) -> Iterator[GroupRows]:
 
 
 def _tilts(problem: Problem) -> dict[tuple[object, str, int], dict[tuple[str, int], str]]:
-    """Room, kind and number of a region, or of a surface that is one region -> the components of
-    unknowns that tilt it, and what such a tilt is called."""
+    """Room, kind and number of a region or surface -> the components of unknowns that tilt it, and
+    what such a tilt is called; the tilts of a region that is its whole surface are that one's."""
     whole = (c for c in problem.cells.values() if c.column == REGION_PART and c.axis is None)
     regions = {cells.room: np.bincount(cells.surface) for cells in whole}
     found: dict[tuple[object, str, int], dict[tuple[str, int], str]] = {}

@@ -87,10 +87,9 @@ class MeshScale(MeshShift):
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         apart = super().params(rig) and rig.reference.mesh
-        return (Param("scale", "1", 0.0005),) if apart else ()
+        return FaroScale().params(rig) if apart else ()
 
-    def basis(self, view: View) -> np.ndarray:
-        return finite(view["point_m"])[:, :, None]
+    basis = FaroScale.basis
 
 
 class MeshStrain(MeshScale):

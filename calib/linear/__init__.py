@@ -13,7 +13,7 @@ are comparable. Unknowns without a prior (``unbounded``: candidates of a diagnos
 
 **Three kinds of unknowns** (`layout`). *Own* unknowns of a stop, its pose and joint errors, are
 touched by that stop alone. *Cells* are displacements of parts of the mesh, of three sizes (surface,
-region, patch), and the tilts of regions. All others, the calibration above all, are *kept*.
+region, patch), and tilts of the larger two. All others, the calibration above all, are *kept*.
 
 **Elimination** (`elimination`) takes own unknowns and cells out by the Schur complement,
 ``H_kk - H_ke H_ee^-1 H_ek``: what remains says of the kept unknowns exactly what all rows say, and

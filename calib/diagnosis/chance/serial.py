@@ -29,11 +29,8 @@ from sensors.stops import in_time
 
 ALPHA_SERIAL = 0.01  # share of random errors that are said not to be: a choice, it names nothing
 FEWEST_PAIRS = 9  # of stops: S over its sd is at most the root of their number, 3 for p = 0.001
-SAME_POSE = (
-    0.01  # rad or m, of each joint: poses that are driven to again are nearer, others hardly
-)
+SAME_POSE = 0.01  # rad or m, of each joint: an arm returns to a pose far nearer than that
 OF_ROWS = {Site.TRACKER: "body", Site.JOINTS: "joints"}  # where widened -> kind of its groups
-
 
 StopKey = tuple[str, str]  # recording and stop
 Pairs = Callable[[Sequence[StopKey]], np.ndarray]  # (P, 2) of some stops
@@ -83,16 +80,16 @@ def _in_time(problem: Problem) -> Pairs:
 def _in_pose(problem: Problem) -> Pairs:
     """Pairs of stops of a recording in which all its joints are read, and alike: each with the next
     of its pose, so that signs of no two products depend on each other."""
-    poses: dict[StopKey, tuple[str, ...]] = {}
+    poses: dict[StopKey, tuple[str, bytes]] = {}
     for source, of in zip(problem.sources, labels(problem.sources), strict=True):
         joints = source.recording.joints
         read = np.flatnonzero(np.isfinite(joints).all(axis=1)) if joints.size else ()
         for k in read:
             near = np.round(joints[k] / SAME_POSE).astype(int)
-            poses[of, source.recording.stops[k]] = (of, *map(str, near.tolist()))
+            poses[of, source.recording.stops[k]] = of, near.tobytes()
 
     def pairs(stops: Sequence[StopKey]) -> np.ndarray:
-        alike: dict[tuple[str, ...], list[int]] = {}
+        alike: dict[tuple[str, bytes], list[int]] = {}
         for k, stop in enumerate(stops):
             if stop in poses:
                 alike.setdefault(poses[stop], []).append(k)

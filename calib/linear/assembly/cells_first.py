@@ -15,7 +15,6 @@ from calib.linear.assembly.common import Assembly, Scanned
 from calib.linear.elimination import Eliminated, eliminate
 from calib.linear.layout import Layout
 from calib.linear.own import OwnRows
-from calib.linear.rows import TWIST
 from calib.linear.system import Values
 from calib.residuals.compiled import add_at
 
@@ -29,17 +28,8 @@ class CellsFirst(Assembly):
         super().__init__(layout, own, raw, np.concatenate([self.own, layout.kept]))
 
     def add_twists(self, beams: Sequence[Scanned]) -> None:
-        """With the twist ``t = T x``, its information A and what it has with all others B, a stop
-        adds ``T' Z + Z' T - T' A T``, where ``Z = A T + B``."""
-        first = len(self.cells)
-        T = np.zeros((len(beams), TWIST, len(self.columns) - first - 1))
-        Z = np.zeros((len(beams), TWIST, len(self.columns)))
-        for i, each in enumerate(beams):
-            T[i][:, self.at[each.columns] - first] = each.chain
-            Z[i][:, each.at] = each.beside
-        moved = np.stack([each.information for each in beams]) @ T
-        Z[:, :, first:-1] += moved
-        self.add_through(T, moved, Z)
+        """All that twists depend on is in the matrix still."""
+        self.add_through(beams)
 
     def eliminate(self, values: Values) -> np.ndarray:
         for rows in self.rows:

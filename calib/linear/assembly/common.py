@@ -138,19 +138,31 @@ class Assembly(ABC):
     def add_twists(self, beams: Sequence[Scanned]) -> None:
         """Add what the beams of stops say of where their LiDARs are."""
 
-    def add_through(self, T: np.ndarray, moved: np.ndarray, Z: np.ndarray) -> None:
-        """Add what twists say by what they depend on.
+    def add_through(self, beams: Sequence[Scanned]) -> tuple[np.ndarray, np.ndarray]:
+        """Add what the twists of K stops say of the others that they depend on.
 
-        Args:
-            T: (K, 6, n) their derivatives by the first n of the others.
-            moved: (K, 6, n) the same, times the twists' information.
-            Z: (K, 6, N) that, and what twists have with all columns.
+        With the twist ``t = T x``, its information A and what it has with all others B, a stop adds
+        ``T' Z + Z' T - T' A T``, where ``Z = A T + B``.
+
+        Returns:
+            A (K, 6, 6), and Z (K, 6, N) by all columns.
         """
-        used, first = np.flatnonzero(T.any(axis=(0, 1))), len(self.cells)
+        first = len(self.cells)
+        A = np.stack([each.information for each in beams])
+        T = np.zeros((len(beams), TWIST, len(self.columns) - first - 1))
+        Z = np.zeros((len(beams), TWIST, len(self.columns)))
+        for i, each in enumerate(beams):
+            at = self.at[each.columns]
+            T[i][:, at[at >= 0] - first] = each.chain[:, at >= 0]
+            Z[i][:, each.at] = each.beside
+        moved = A @ T
+        Z[:, :, first:-1] += moved
+        used = np.flatnonzero(T.any(axis=(0, 1)))
         chain = T.reshape(-1, T.shape[2])[:, used]
         self.half[first + used] += chain.T @ Z.reshape(-1, Z.shape[2])
         both = chain.T @ moved.reshape(-1, T.shape[2])[:, used]
         self.half[np.ix_(first + used, first + used)] -= both / 2
+        return A, Z
 
     def add_kept(self, sums: KeptSums) -> None:
         """Add the sums of whitened rows of scatter within holds, which are about kept unknowns."""

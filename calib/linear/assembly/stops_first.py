@@ -45,33 +45,24 @@ class StopsFirst(Assembly):
         """Add what the beams of stops say of where their LiDARs are, and the stops' own rows;
         eliminate what is their own.
 
-        With the twist ``t = T_o o + T_k k`` of own and kept unknowns, its information A and what it
-        has with all others B, a stop adds ``T_k' Z + Z' T_k - T_k' A T_k`` to the others, where
-        ``Z = A T_k + B``; its own have ``T_o' A T_o`` with each other and ``T_o' Z`` with the rest.
+        With the twist ``t = T_o o + T_k k`` of own and kept unknowns, and A and Z as `add_through`
+        has them for T_k, its own have ``T_o' A T_o`` with each other and ``T_o' Z`` with the rest.
         """
         by_stop = {each.stop: each for each in beams}
-        kept = positions(self.layout.size, self.layout.kept)
         for some in self._alike(list(by_stop)):
             mine, at = self._columns(some[0])
             count, (rows, _) = len(self._own(some[0])), self._stacked(some, at, len(mine))
             others = self.at[mine[count:]]
-            A = np.stack([by_stop[stop].information for stop in some])
+            A, Z = self.add_through([by_stop[stop] for stop in some])
             T_own = np.zeros((len(some), TWIST, count))
-            T_kept = np.zeros((len(some), TWIST, len(self.layout.kept)))
-            Z = np.zeros((len(some), TWIST, len(self.columns)))
             place = np.full(self.layout.size, -1)
             for i, stop in enumerate(some):
                 each = by_stop[stop]
                 place[self._own(stop)] = np.arange(count)
-                here, there = place[each.columns], kept[each.columns]
+                here = place[each.columns]
                 T_own[i][:, here[here >= 0]] = each.chain[:, here >= 0]
-                T_kept[i][:, there[there >= 0]] = each.chain[:, there >= 0]
-                Z[i][:, each.at] = each.beside
                 place[self._own(stop)] = -1
                 self.waiting.pop(stop, None)
-            moved = A @ T_kept
-            Z[:, :, len(self.cells) : -1] += moved
-            self.add_through(T_kept, moved, Z)
             self._add_squares(rows[:, :, count:], others)
             if not count:
                 continue
@@ -98,7 +89,7 @@ class StopsFirst(Assembly):
         rows. Its rows are turned so that only six, the rank of a twist, touch more columns than R.
 
         Args:
-            factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `add_twists`.
+            factor: (K, o, o), T_own: (K, 6, o), Z: (K, 6, N) as of `add_through`.
             rows: (K, m, o + r) own rows, of which the last r stand at `others` (r,).
         """
         count = factor.shape[1]
