@@ -56,20 +56,19 @@ class Sampled:
         origin_m = se3.apply(self.T, ray.origin_m[some])
         return Beams(origin_m, ray.direction[some] @ R.T, ray.range_m[some])
 
-    def off_m(self, at: np.ndarray) -> np.ndarray:
-        """Mean error (G,) of some beams, of maps (G, 4, 4) from the LiDAR's frame to the mesh's."""
+    def off_m(self, at: np.ndarray, beams: int = BEAMS_A_SCAN) -> np.ndarray:
+        """Mean error (G,) of so many beams, of maps (G, 4, 4) from the LiDAR's frame to the
+        mesh's."""
         _, ray = self.scan.store.read(self.scan.index)
-        some = np.linspace(0, len(ray.range_m) - 1, BEAMS_A_SCAN).round().astype(int)
+        some = np.linspace(0, len(ray.range_m) - 1, beams).round().astype(int)
         linear = at[:, :3, :3].mT
         origin = ray.origin_m[some] @ linear + at[:, None, :3, 3]
         direction = ray.direction[some] @ linear
         range_m = np.tile(ray.range_m[some], len(at))
-        beams, here = Beams(origin.reshape(-1, 3), direction.reshape(-1, 3), range_m), np.eye(4)
-        met = self.scan.meeting.associate(here, beams, {}, near_edges=False)
-        surface = self.scan.meeting.meet(here, beams, {}, met)
-        off_m = np.where(
-            surface.usable, np.abs(beams.range_m - surface.predicted_m), FARTHEST_OFF_M
-        )
+        rays, here = Beams(origin.reshape(-1, 3), direction.reshape(-1, 3), range_m), np.eye(4)
+        met = self.scan.meeting.associate(here, rays, {}, near_edges=False)
+        surface = self.scan.meeting.meet(here, rays, {}, met)
+        off_m = np.where(surface.usable, np.abs(range_m - surface.predicted_m), FARTHEST_OFF_M)
         return np.minimum(off_m, FARTHEST_OFF_M).reshape(len(at), -1).mean(axis=1)
 
 
@@ -86,9 +85,11 @@ def asked(scans: Sequence[Sampled]) -> list[Sampled]:
     return [scans[i] for i in chosen]
 
 
-def turned_off_m(scans: Sequence[Sampled], turns: np.ndarray) -> np.ndarray:
-    """Mean error (G,) of the beams of all, with the LiDAR turned (G, 3, 3)."""
-    return np.mean([each.off_m(each.turned(turns)) for each in scans], axis=0)
+def turned_off_m(
+    scans: Sequence[Sampled], turns: np.ndarray, beams: int = BEAMS_A_SCAN
+) -> np.ndarray:
+    """Mean error (G,) of so many beams of each, with the LiDAR turned (G, 3, 3)."""
+    return np.mean([each.off_m(each.turned(turns), beams) for each in scans], axis=0)
 
 
 def sampled_by_recording(problem: Problem, values: Values) -> dict[int, list[Sampled]]:
