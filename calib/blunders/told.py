@@ -329,7 +329,8 @@ def suspect(left: LeftOut) -> str:
     """Of what is furthest out, where a fit without it has no optimum either."""
     return (
         f"Furthest from everything else: {left.blunder.group}. Without it the fit does not "
-        "converge either, so it need not be the cause; look at it first."
+        "converge either, so it need not be the cause; look at it first. 'rigcal check' tries "
+        "signs, axes and columns that may be mixed up in the whole recording."
     )
 
 

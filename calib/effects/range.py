@@ -31,6 +31,10 @@ class RangeEffect(Effect):
         raise NotImplementedError
 
 
+def _slant(view: View) -> np.ndarray:
+    return 1.0 / np.cos(incidence_rad(view)) - 1.0
+
+
 class RangeOffset(RangeEffect):
     """The whole sensor has one range zero: ``measured = true + a``."""
 
@@ -163,7 +167,7 @@ class IncidenceAngleBias(RangeEffect):
     source = "Laconte et al., Lidar Measurement Bias Estimation; Agishev et al., arXiv 2303.01123"
 
     def column(self, view: View) -> np.ndarray:
-        return 1.0 / np.cos(incidence_rad(view)) - 1.0
+        return _slant(view)
 
 
 class IntensityRangeWalk(RangeEffect):
@@ -191,17 +195,39 @@ class LabelRangeOffset(Effect):
     typical = "0 to 10 mm; none found on stone"
     covariates = ("label",)
     of_members = True
+    sigma = 0.005
     confounded_with = ("intensity_range_walk", "moved_surface", "range_offset")
     source = "Lenda 2015, PFG: plexiglas and polystyrene; Lichti and Harvey: none on stone"
 
     def params(self, rig: Rig) -> tuple[Param, ...]:
         names = rig.labels.items() if rig.lidar else ()
-        return tuple(Param(f"{number}_{name}", "m", 0.005) for number, name in names)
+        return tuple(Param(f"{number}_{name}", "m", self.sigma) for number, name in names)
+
+    def column(self, view: View) -> np.ndarray:
+        """(rows,) or (1,) what a label's parameter is multiplied by."""
+        return np.ones(1)
 
     def basis(self, view: View) -> OneHot:
         index = place_of(view["label"], np.array(list(view.rig.labels)))
-        along = np.broadcast_to([1.0, 0.0, 0.0], (len(index), 3))
-        return OneHot(index, along, len(view.rig.labels))
+        values = np.zeros((len(index), 3))
+        values[:, 0] = self.column(view)
+        return OneHot(index, values, len(view.rig.labels))
+
+
+class LabelIncidenceBias(LabelRangeOffset):
+    """Light that enters a material at a slant goes further in it: every label has its own
+    `incidence_angle_bias`."""
+
+    name = "label_incidence_bias"
+    sigma = IncidenceAngleBias.sigma
+    formula = "range = true + k_label * (1 / cos(incidence) - 1)"
+    typical = "1 to 10 mm at 60 degrees of what is translucent or polished, else 0; size assumed"
+    covariates = ("label", "incidence_rad")
+    confounded_with = ("incidence_angle_bias", "label_range_offset", "moved_surface")
+    source = "as `incidence_angle_bias` and `label_range_offset`; size assumed"
+
+    def column(self, view: View) -> np.ndarray:
+        return _slant(view)
 
 
 class WarmupDrift(RangeEffect):

@@ -192,18 +192,24 @@ def odd_stops(rig: Rig, recording: RecordedStops) -> Iterator[str]:
 
 
 def odd_times(recording: RecordedStops) -> Iterator[str]:
-    """Times in another unit than seconds, and two of them that seem exchanged."""
-    order = np.argsort(recording.time_s, kind="stable") if recording.timed else np.zeros(0, int)
+    """Times in another unit, two that seem exchanged, a clock that seems to have started again."""
+    time_s = recording.time_s if recording.timed else np.zeros(1)
+    order = np.argsort(time_s, kind="stable")
     moved = np.flatnonzero(order != np.arange(len(order)))
+    back = np.flatnonzero(np.diff(time_s) < 0)
     if len(moved) == 2 and len(order) >= FEWEST_IN_ORDER:
         a, b = (recording.stops[k] for k in moved)
         yield (
             f"the rows of stops.csv are in the order of time_s but for {a} and {b}, and all would "
             "be with the times of these two exchanged; are they?"
         )
-    gaps_s = np.diff(np.sort(recording.time_s)) if recording.timed else np.zeros(0)
+    elif len(back) == 1 and time_s[-1] > time_s[0]:
+        yield (
+            f"time_s in stops.csv goes back once, from {recording.stops[back[0]]} to "
+            f"{recording.stops[back[0] + 1]}, and rises else: did a clock start again there?"
+        )
+    gaps_s, last_s = np.diff(np.sort(time_s)), float(np.max(time_s))
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0
-    last_s = float(np.max(recording.time_s)) if recording.timed else 0.0
     if last_s > LAST_DATE_S:
         unit = next(name for name, (_, until_s) in FINER_UNITS.items() if last_s < until_s)
         yield f"time_s in stops.csv goes up to {last_s:.3g} s: is it in {unit} since 1970?"

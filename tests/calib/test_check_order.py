@@ -50,6 +50,18 @@ def test_two_times_that_are_exchanged(sound):
     assert f"but for {recording.stops[3]} and {recording.stops[7]}," in said
 
 
+def test_a_clock_that_started_again(sound):
+    """Rows of days that were written in another order step back as well, but do not overlap."""
+    _, recording = sound
+    at = len(recording.stops) // 2
+    time_s = recording.time_s - np.where(np.arange(len(recording.stops)) < at, 0.0, 0.9) * (
+        recording.time_s[at] - recording.time_s[0]
+    )
+    (said,) = odd_times(replace(recording, time_s=time_s))
+    assert f"once, from {recording.stops[at - 1]} to {recording.stops[at]}," in said
+    assert not [*odd_times(replace(recording, time_s=np.roll(recording.time_s, at)))]
+
+
 @pytest.fixture
 def arm(shared):
     folder = shared / "recordings" / "arm_axes_miss_each_other"

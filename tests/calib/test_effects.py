@@ -149,7 +149,7 @@ def bare(tmp_path_factory):
 @pytest.mark.parametrize("effect", effects.CATALOGUE, ids=lambda e: e.name)
 def test_a_rig_without_what_it_acts_on_has_no_such_effect(effect, bare):
     lidar, arm = bare
-    unknown = {"label_range_offset", "range_quantisation"}
+    unknown = {"label_range_offset", "label_incidence_bias", "range_quantisation"}
     of_lidar = effect.site in (Site.BEAM, Site.NOISE) and effect.name not in unknown
     assert bool(effect.params(lidar)) == (of_lidar or effect.needs_standing)
     unknown = {"arm_gravity_sag", "arm_link_bending", "base_flex", "mount_bending"}
