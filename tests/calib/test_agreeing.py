@@ -88,9 +88,8 @@ def test_a_single_one_is_left_to_others():
     assert split(values) is None
 
 
-@pytest.mark.parametrize(
-    "which", [(2, 5, 6), pytest.param((1, 3, 5, 7, 9, 11), marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("which", [(2, 5, 6), (1, 3, 5, 7, 9, 11)])
 def test_a_body_that_is_seen_turned_at_some_stops_is_no_scatter(tmp_path, which):
     """One marker is taken for another, and the body turns by a degree: stops scattered, "random as
     far as these data show", and with that the model was adequate."""

@@ -99,6 +99,7 @@ def test_a_tracker_of_the_other_hand_is_told_by_its_targets(home, tmp_path):
     assert "left-handed" in bad["sentence"]
 
 
+@pytest.mark.long
 def test_spheres_under_each_others_names_are_what_is_wrong_and_nothing_that_they_drag_along(
     home, tmp_path
 ):

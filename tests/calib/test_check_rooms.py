@@ -42,6 +42,7 @@ ROOMS = {  # what is in the room, its size, and who goes round in it
     "bare square": (bare(), (7.0, 7.0, 2.9), HAND),
 }
 SOUND = [name for name in ROOMS if "bare" not in name]
+UNTRACKED = pytest.param(False, marks=pytest.mark.long)
 
 
 def recorded(folder, name, degrees=0.0, **how):
@@ -69,13 +70,13 @@ def told(folder):
     return [line for line in found.odd if line.startswith(starts)]
 
 
-@pytest.mark.parametrize("tracked", [True, False], ids=["tracked", "untracked"])
+@pytest.mark.parametrize("tracked", [True, UNTRACKED], ids=["tracked", "untracked"])
 @pytest.mark.parametrize("name", SOUND)
 def test_a_guess_that_is_right_is_left_alone(tmp_path, name, tracked):
     assert told(recorded(tmp_path / "rec", name, tracked=tracked)) == []
 
 
-@pytest.mark.parametrize("tracked", [True, False], ids=["tracked", "untracked"])
+@pytest.mark.parametrize("tracked", [True, UNTRACKED], ids=["tracked", "untracked"])
 @pytest.mark.parametrize(
     ("name", "degrees"),
     [(name, 180) for name in SOUND] + [("one box in a square", 90), ("one box in a square", -90)],
@@ -89,7 +90,7 @@ def test_a_guess_that_has_the_room_turned_is_told(tmp_path, name, degrees, track
 
 @pytest.mark.parametrize("tracked", [True, False], ids=["tracked", "untracked"])
 @pytest.mark.parametrize(("name", "by"), [("bare", "180"), ("bare square", "90, 180 or 270")])
-@pytest.mark.parametrize("degrees", [0, 180])
+@pytest.mark.parametrize("degrees", [pytest.param(0, marks=pytest.mark.long), 180])
 def test_where_only_a_guess_tells_it_is_said(tmp_path, name, by, degrees, tracked):
     (said,) = told(recorded(tmp_path / "rec", name, degrees, tracked=tracked))
     assert said.startswith(f"{LIKE}{by} deg about its middle")

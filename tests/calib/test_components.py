@@ -143,10 +143,8 @@ def test_which_way_to_the_lidar_scatters_is_told(tmp_path, name):
     assert diagnose(add(run, [name], tmp_path / "grown")).verdict == "adequate"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["stop_pose_scatter", pytest.param("tracker_scatter", marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["stop_pose_scatter", "tracker_scatter"])
 def test_on_one_tracked_body_a_mount_that_gives_is_a_tracker_that_scatters(tmp_path, name):
     spec = SPEC.model_copy(update={"arm": False, "column_step": 60})
     simulate(spec, tmp_path / "rec", 9, {name: 3.0})

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calib import problem as problems
 from calib.problem.model import Model
@@ -28,6 +29,7 @@ def with_moved_curtain(source):
     return replace(source, reference=Reference(vertices_m, mesh.triangles, mesh.label))
 
 
+@pytest.mark.long
 def test_a_curtain_that_hangs_elsewhere_hardly_moves_the_mesh(tmp_path):
     """By 2 mm, four times what surfaces are off: as one surface of many it counts a little. With
     patches that are one all over its waves it moved the mesh by 0.65 mm, five sigmas."""

@@ -91,6 +91,7 @@ def test_as_many_are_drawn_as_are_asked_for():
         assert set(group[some]) == {0, 1, 2, 3}
 
 
+@pytest.mark.long
 def test_a_diagnosis_of_some_beams_names_what_is_missing_and_says_how_many_they_were(
     tmp_path, monkeypatch
 ):

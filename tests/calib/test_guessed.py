@@ -124,6 +124,7 @@ def test_where_all_may_be_shifted_together_stops_held_out_are_expected_as_they_a
     assert not summary["odd"]
 
 
+@pytest.mark.long
 def test_exchanged_scans_of_a_room_without_a_mesh_are_told(tmp_path):
     """Each makes planes of its own, which fit: nothing else is off."""
     folder = untracked(tmp_path / "rec", ROOM)

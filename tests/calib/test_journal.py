@@ -167,6 +167,7 @@ def in_look(number: int):
     return progress
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("unhurried")
 def test_a_diagnosis_that_is_cut_short_goes_on(tmp_path, caplog):
     """To the same document, through every fit and look on its way; one that is asked anything else

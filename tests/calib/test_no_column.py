@@ -67,6 +67,7 @@ def without_mesh(folder):
         del rig["reference"]
 
 
+@pytest.mark.long
 def test_what_one_recording_of_two_lacks_is_not_tested_and_said(tmp_path):
     """It was an error of the diagnosis: no effect could be looked for in such recordings."""
     found = one_of_two(tmp_path, otherwise)

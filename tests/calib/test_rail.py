@@ -41,7 +41,7 @@ def seen(world, read, joint):
     return tool(world, T)
 
 
-@pytest.mark.parametrize("arm", ["gantry", "stanford"])
+@pytest.mark.parametrize("arm", ["gantry", pytest.param("stanford", marks=pytest.mark.long)])
 def test_it_is_named_alone_and_sized(tmp_path, arm):
     """It was told as a joint's scale and a distortion of the tracker, each making up for the other:
     the scale was 17 of its sigmas off."""
@@ -63,7 +63,7 @@ def test_it_is_named_alone_and_sized(tmp_path, arm):
     assert diagnose(after).verdict == "adequate"
 
 
-@pytest.mark.parametrize("lead", [0.02, 0.4])
+@pytest.mark.parametrize("lead", [0.02, pytest.param(0.4, marks=pytest.mark.long)])
 def test_an_uneven_screw_is_named_and_its_lead_found(tmp_path, lead):
     """That of a screw to buy, and one that no list has. It was told as a joint that scatters."""
     rng, folder = np.random.default_rng(4), tmp_path / "rec"

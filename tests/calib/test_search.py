@@ -134,7 +134,9 @@ def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
         assert same.sd == pytest.approx(spread.sd, abs=0.01 * spread.sigma)
 
 
-@pytest.mark.parametrize("first", [95, 96, 97, 98])
+@pytest.mark.parametrize(
+    "first", [95, *(pytest.param(n, marks=pytest.mark.long) for n in (96, 97, 98))]
+)
 def test_what_slips_does_so_between_two_stops_and_none_of_them_is_a_blunder(tmp_path, first):
     """A grid of times, and a finer one beside the best of it, are 4 stops apart. Stops between the
     true time and one of these stand out alone."""

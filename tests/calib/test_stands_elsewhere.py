@@ -44,7 +44,8 @@ def test_a_wall_that_stands_elsewhere_is_no_clutter(tmp_path, by_m):
     assert ("nearer" if by_m > 0 else "farther") in blunder["sentence"]
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(6, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [4, 6])
 def test_a_wall_that_was_moved_is_told_with_the_first_stop_of_it(tmp_path, seed):
     first = 7
     found, run = rejected(tmp_path, replace(ROOM, seed=seed, shifted=((3,), first, 0.06)))
@@ -156,9 +157,8 @@ def test_boxes_in_front_of_the_mesh_are_no_part_of_it_that_moved(tmp_path):
 STANDS = World(seed=4, locations=3, stops=6, beams=1500, stands=True)
 
 
-@pytest.mark.parametrize(
-    ("by_m", "by_rad"), [(0.001, 0.001), pytest.param(0.02, 0.02, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("by_m", "by_rad"), [(0.001, 0.001), (0.02, 0.02)])
 def test_a_rig_that_is_pushed_has_moved_and_not_the_room(tmp_path, by_m, by_rad):
     """It stands still over six stops, as its description says, but for one push within them: ranges
     change by 2 and by 49 mm. Such rigs were told to have a joint that slipped, or a mesh in two

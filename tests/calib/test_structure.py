@@ -43,10 +43,8 @@ HIDDEN = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "change", [one_ring, pytest.param(elevations, marks=pytest.mark.long)], ids=lambda c: c.__name__
-)
+@pytest.mark.long
+@pytest.mark.parametrize("change", HIDDEN, ids=lambda c: c.__name__)
 def test_it_is_told_and_what_describes_it_leaves_nothing(tmp_path, change):
     folder = tmp_path / "rec"
     write(World(seed=8, locations=5, stops=4, beams=2500), folder)

@@ -18,7 +18,7 @@ def warm_locations(rng, c):
     return {"temperature_c": np.repeat(each, len(c["ring"]) // stops)}
 
 
-@pytest.mark.parametrize("seed", [2, 4, 5])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(n, marks=pytest.mark.long) for n in (4, 5))])
 @pytest.mark.parametrize("size_m", [12e-3, 0.0])
 def test_six_locations_tell_a_gross_structure_from_one_of_its_covariates(seed, size_m):
     """What it does at each differs as much as the temperatures do, so a test of how much worse a
