@@ -374,7 +374,12 @@ def test_the_same_function_of_a_covariate_that_goes_along_says_nothing_else():
     assert [f.term for f in found.alike] == [WAVE]
 
 
-def test_texts_of_a_term_are_formulas_that_a_file_can_have(found):
-    for name in PLANTED:
-        for formula in found(name)[2]:
-            assert all(re.fullmatch(r"[\w\s.*/+\-()<>=,]+", text) for text in formula.texts)
+OTHERS = [name for name in PLANTED if name not in CONSTANTS]
+
+
+@pytest.mark.parametrize(
+    "name", [*CONSTANTS, *(pytest.param(each, marks=pytest.mark.long) for each in OTHERS)]
+)
+def test_texts_of_a_term_are_formulas_that_a_file_can_have(found, name):
+    for formula in found(name)[2]:
+        assert all(re.fullmatch(r"[\w\s.*/+\-()<>=,]+", text) for text in formula.texts)
