@@ -17,7 +17,7 @@ PYTHON = $(firstword $(foreach p,python3.11 python3,$(shell $(p) -c \
 LIBRARIES = libusb-1.0-0 libgl1 libgomp1 libx11-6
 BIN = .venv/bin
 OPEN3D_LOADS = $(BIN)/python -c 'import sys; sys.tracebacklimit = 0; import open3d'
-# What is used is compiled when it is first imported: to compile all of it takes a third as long again.
+# What is used is compiled when it is first imported; to compile all of it takes 14 s more of CPU.
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 # What tests of a file share is made once; files stay in the order that tests/conftest.py gives them.
 PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

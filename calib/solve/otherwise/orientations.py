@@ -26,7 +26,8 @@ from chains import se3
 # 0.3 rad away passes over the scans find the optimum.
 STEP_RAD, FINER_RAD, BEST = 0.3, (0.15, 0.07), 8
 # Of the first grid's 3,000 a few beams, of all scans together, choose those that all are asked
-# about. In nine rooms, turned 27 ways, 100 beams and 50 orientations found what all beams did.
+# about. In nine rooms, turned 27 ways, 100 beams and 50 orientations found what all beams did
+# (`tests/bench/bench_turns.py`).
 CHOOSING_BEAMS, CHOSEN = 160, 200
 
 
