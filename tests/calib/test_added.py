@@ -106,6 +106,7 @@ def test_a_ring_that_meets_clutter_is_not_known_by_the_beams_that_agree_by_chanc
     assert np.median(sigma) < 1.5e-3
 
 
+@pytest.mark.long
 def test_a_diagnosis_says_which_ring_nobody_knows(tmp_path):
     source, _ = made(tmp_path / "rec", SMALL)
     source = with_ring_off(source, 12, clutter(5))

@@ -12,7 +12,7 @@ from calib.runs.diagnose import diagnose
 from calib.simulation import Spec, simulate
 
 # A furnished lab, whose whiteboard stands off the wall by 25 mm.
-LAB = Spec(mesh=False, targets=0, locations=5, column_step=128)
+LAB = Spec(mesh=False, targets=0, locations=5, column_step=64)
 BOARD_MM = 25.0
 # What of an effect's size is unsure, as fits have it: the mean of 128 ring zeros.
 MEAN_SIGMAS = 3.0

@@ -182,7 +182,10 @@ def test_no_formula_is_sought_for_a_joint_that_nobody_read(folders, tmp_path):
     assert np.sum(sigma > 0.1) == 1 and np.sum(sigma < 0.01) == 39
 
 
-@pytest.mark.parametrize("passive", [("joint_2",), ("joint_1", "joint_3", "joint_5")])
+@pytest.mark.parametrize(
+    "passive",
+    [("joint_2",), pytest.param(("joint_1", "joint_3", "joint_5"), marks=pytest.mark.long)],
+)
 def test_a_scan_tells_where_joints_were_whose_body_was_not_seen(tmp_path, passive):
     """The optimum is that of the same recording in which the body was seen at these stops, too."""
     scanned = {**PRESETS["tiny"].model_dump(), "passive": passive, "occluded_share": 0}

@@ -72,6 +72,7 @@ def test_a_run_is_made_again(folder, name):
     assert found.files == 4 + len(list((folder / name / "residuals.parquet").iterdir()))
 
 
+@pytest.mark.long
 def test_the_steps_of_growth_are_made_again_and_not_the_runs(folder, tmp_path):
     """A run that stands alone holds all that it needs, but for its recording."""
     alone = Run.open(shutil.copytree(folder / "deeper/third", tmp_path / "x/alone"))
