@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib.effects.base import Effect, OneHot, Param, Site, View
@@ -29,10 +31,6 @@ class RangeEffect(Effect):
     def column(self, view: View) -> np.ndarray:
         """By how much range grows per unit of the parameter, (rows,) or (1,)."""
         raise NotImplementedError
-
-
-def _slant(view: View) -> np.ndarray:
-    return 1.0 / np.cos(incidence_rad(view)) - 1.0
 
 
 class RangeOffset(RangeEffect):
@@ -167,7 +165,7 @@ class IncidenceAngleBias(RangeEffect):
     source = "Laconte et al., Lidar Measurement Bias Estimation; Agishev et al., arXiv 2303.01123"
 
     def column(self, view: View) -> np.ndarray:
-        return _slant(view)
+        return 1.0 / np.cos(incidence_rad(view)) - 1.0
 
 
 class IntensityRangeWalk(RangeEffect):
@@ -203,15 +201,10 @@ class LabelRangeOffset(Effect):
         names = rig.labels.items() if rig.lidar else ()
         return tuple(Param(f"{number}_{name}", "m", self.sigma) for number, name in names)
 
-    def column(self, view: View) -> np.ndarray:
-        """(rows,) or (1,) what a label's parameter is multiplied by."""
-        return np.ones(1)
-
     def basis(self, view: View) -> OneHot:
         index = place_of(view["label"], np.array(list(view.rig.labels)))
-        values = np.zeros((len(index), 3))
-        values[:, 0] = self.column(view)
-        return OneHot(index, values, len(view.rig.labels))
+        along = np.broadcast_to([1.0, 0.0, 0.0], (len(index), 3))
+        return OneHot(index, along, len(view.rig.labels))
 
 
 class LabelIncidenceBias(LabelRangeOffset):
@@ -226,8 +219,8 @@ class LabelIncidenceBias(LabelRangeOffset):
     confounded_with = ("incidence_angle_bias", "label_range_offset", "moved_surface")
     source = "as `incidence_angle_bias` and `label_range_offset`; size assumed"
 
-    def column(self, view: View) -> np.ndarray:
-        return _slant(view)
+    def basis(self, view: View) -> OneHot:
+        return replace(super().basis(view), values=IncidenceAngleBias().basis(view)[..., 0])
 
 
 class WarmupDrift(RangeEffect):

@@ -206,7 +206,7 @@ def odd_times(recording: RecordedStops) -> Iterator[str]:
     elif len(back) == 1 and time_s[-1] > time_s[0]:
         yield (
             f"time_s in stops.csv goes back once, from {recording.stops[back[0]]} to "
-            f"{recording.stops[back[0] + 1]}, and rises else: did a clock start again there?"
+            f"{recording.stops[back[0] + 1]}, and rises otherwise: did a clock start again there?"
         )
     gaps_s, last_s = np.diff(np.sort(time_s)), float(np.max(time_s))
     usual_s = float(np.median(gaps_s[gaps_s > 0])) if np.any(gaps_s > 0) else 0.0
