@@ -83,6 +83,7 @@ from calib.effects.range import (
     WarmupDrift,
 )
 from calib.effects.reference import (
+    FaroRangeOffset,
     FaroScale,
     MeshScale,
     MeshSeamX,
@@ -194,6 +195,7 @@ CATALOGUE: tuple[Effect, ...] = (
     TargetRodTilt(),
     TargetSphereOffset(),
     FaroScale(),
+    FaroRangeOffset(),
     MeshShift(),
     MeshScale(),
     MeshStrain(),

@@ -41,6 +41,33 @@ class FaroScale(Effect):
         return finite(view["point_m"])[:, :, None]
 
 
+class FaroRangeOffset(Effect):
+    """The scanner's ranges are too short or too long by a constant. Its mesh and its spheres lie
+    nearer to where it stood, or further from there, than the room does. Of several stations, each
+    point is seen from the nearest."""
+
+    name = "faro_range_offset"
+    site = Site.REFERENCE
+    unit = "m"
+    formula = "surface or sphere = scanned + b * unit vector from the scanner (`scanner_m`)"
+    typical = "up to 2 mm on the data sheets of phase scanners"
+    covariates = ("point_m",)
+    confounded_with = ("faro_scale", "mesh_scale", "range_offset")
+    source = "rangefinder offset of a scanner: Lichti and Licht 2006, IAPRS XXXVI-5"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        stood = rig.reference and rig.reference.scanner_m
+        return (Param("range_offset", "m", 0.001),) if stood else ()
+
+    def basis(self, view: View) -> np.ndarray:
+        point_m = view["point_m"]
+        from_each = finite(point_m)[:, None] - np.array(view.rig.reference.scanner_m)
+        distance = np.linalg.norm(from_each, axis=2)
+        nearest = np.arange(len(point_m)), distance.argmin(axis=1)
+        away = from_each[nearest] / np.maximum(distance[nearest], np.finfo(float).tiny)[:, None]
+        return (away * np.isfinite(point_m))[:, :, None]
+
+
 class MeshShift(Effect):
     """The mesh is not in the frame of the spheres: the scanner was set up again between them, or
     the mesh was exported in another frame.

@@ -58,13 +58,15 @@ class TargetSpec:
 
 @dataclass(frozen=True)
 class ReferenceSpec:
-    """The scanned mesh: its world frame, its files, and the error of its surface [m]."""
+    """The scanned mesh: its world frame, its files, the error of its surface [m], and where the
+    scanner stood, each station (3,) [m] in that frame."""
 
     frame: str
     mesh: Path
     faces: Path | None
     labels: Path | None
     sigma_m: float
+    scanner_m: tuple[tuple[float, float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -320,7 +322,9 @@ def _read_reference(reference: ReferenceDocument, folder: Path, where: _Where) -
         key: where.file(folder, getattr(reference, key), "reference", key)
         for key in ("mesh", "faces", "labels")
     }
-    return ReferenceSpec(frame=reference.frame, sigma_m=reference.sigma_m, **paths)
+    return ReferenceSpec(
+        frame=reference.frame, sigma_m=reference.sigma_m, scanner_m=reference.scanner_m, **paths
+    )
 
 
 def _read_effects(names: tuple[str, ...], folder: Path, where: _Where) -> tuple[Path, ...]:

@@ -45,6 +45,11 @@ def _in_a_row(tip: object) -> object:
     return (tip,) if isinstance(tip, str) else tip
 
 
+def _each_station(stood: object) -> object:
+    flat = isinstance(stood, list) and stood and not any(isinstance(x, list) for x in stood)
+    return [stood] if flat else stood
+
+
 class FrameDocument(Document):
     """An edge from CAD, and how sure CAD is of it."""
 
@@ -152,6 +157,9 @@ class ReferenceDocument(Document):
     faces: str | None = None
     labels: str | None = None
     sigma_m: Size
+    scanner_m: Annotated[
+        tuple[tuple[Number, Number, Number], ...], pydantic.BeforeValidator(_each_station)
+    ] = ((0.0, 0.0, 0.0),)
 
 
 class RigDocument(Document):

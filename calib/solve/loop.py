@@ -180,13 +180,20 @@ class Loop(Descent):
         return True
 
     def take_spread(self, tolerance: float) -> None:
-        """Estimate how widely values by chance scatter, and go on with that, until it settles.
+        """Estimate how widely values by chance scatter, and go on with that, until it settles, and
+        so do the robust weights, which are relative to it.
 
         Args:
             tolerance: as of `settle`.
         """
-        if self._near_spread(settled=True) and self.problem.scans:
-            self.settle_on(tolerance)
+        for _ in range(SPREAD):
+            if not self._near_spread(settled=True):
+                return
+            weighed = self.reweigh(beams=bool(self.problem.scans))
+            if self.problem.scans:
+                self.settle_on(tolerance)
+            if not weighed:
+                return
 
     def begin_spread(self) -> None:
         """The same once it is known what beams meet, and before the passes to the optimum: most of

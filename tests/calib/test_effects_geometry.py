@@ -289,6 +289,17 @@ def test_the_mesh_is_stretched_about_its_origin(source):
     np.testing.assert_array_equal(found @ [1e-3], [[1e-3, -2e-3, 3e-3], [0, 0, 0]])
 
 
+def test_scanned_points_lie_further_from_the_nearest_station(source):
+    stations = ((-2.0, 0.0, 1.0), (2.0, 0.0, 1.0))
+    rig = replace(source.rig, reference=replace(source.rig.reference, scanner_m=stations))
+    point_m = np.array([[-2.0, 3.0, 1.0], [2.5, 0.0, 1.0], [np.nan] * 3, stations[0]])
+    effect = find("faro_range_offset")
+    found = effect.basis(View(rig, 4, {"point_m": point_m}, np.zeros((1, 6)))) @ [0.002]
+    np.testing.assert_allclose(found, [[0, 0.002, 0], [0.002, 0, 0], [0, 0, 0], [0, 0, 0]])
+    nowhere = replace(rig, reference=replace(rig.reference, scanner_m=()))
+    assert effect.of_scanner and effect.params(rig) and not effect.params(nowhere)
+
+
 def test_the_mesh_is_moved_as_a_rigid_body_and_the_spheres_are_not(source):
     effect, twist = find("mesh_shift"), np.array([3e-3, -1e-3, 2e-3, 1e-5, -3e-5, 2e-5])
     point_m = np.random.default_rng(0).normal(size=(6, 3))

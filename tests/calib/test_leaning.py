@@ -1,4 +1,4 @@
-"""Surfaces of a mesh that lean as a whole, and meshes that are stretched or have another metre."""
+"""Meshes that are wrong as a whole: surfaces that lean, another metre, a scanner's range offset."""
 
 import numpy as np
 import pytest
@@ -72,6 +72,31 @@ def test_a_mesh_that_is_stretched_is_named_where_the_spheres_are_right(tmp_path,
     effect = grown.solution.shared.effects[name]
     first = effect.estimate[list(effect.names).index("scale" if name == "mesh_scale" else "xx")]
     assert first == pytest.approx(1.0 / stretch[0] - 1.0, abs=2.5e-4)
+    assert max(sigmas(grown, folder).values()) < 4.0
+
+
+def test_a_scanner_whose_ranges_are_too_long_is_named_where_it_is_known_where_it_stood(tmp_path):
+    """Mesh and spheres move away from there; it was called a metre that is too long, and left the
+    frame 5 sigmas off."""
+    station, too_long_m = np.array([-3.0, -2.5, 1.5]), 0.003
+
+    def scanned(points):
+        away = points - station
+        return points + too_long_m * away / np.linalg.norm(away, axis=1, keepdims=True)
+
+    folder = lab(tmp_path / "rec", lambda vertices, _: scanned(vertices))
+    scene = Scene(folder, np.random.default_rng(0))
+    with scene.sheet("targets.csv") as targets:
+        names = ("faro_x", "faro_y", "faro_z")
+        targets.put(scanned(targets.numbers(*names)), *names)
+    with scene.description() as rig:
+        rig["reference"]["scanner_m"] = [station.tolist()]
+    run = fit([folder], tmp_path / "run")
+    found = diagnose(run)
+    assert found.worth_adding == ["faro_range_offset"]
+    grown = add(run, found.worth_adding, tmp_path / "grown")
+    effect = grown.solution.shared.effects["faro_range_offset"]
+    assert effect.estimate[0] == pytest.approx(-too_long_m, abs=3 * effect.sigma[0])
     assert max(sigmas(grown, folder).values()) < 4.0
 
 

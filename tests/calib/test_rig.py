@@ -81,7 +81,22 @@ def test_the_rig_is_what_the_file_says(write):
     }  # fmt: skip
     assert rig.target.sphere_below_lower_marker_m == 0.18
     assert rig.reference.mesh == folder / "reference/mesh.ply" and rig.reference.faces is None
+    assert rig.reference.scanner_m == ((0.0, 0.0, 0.0),)
     assert (rig.shared, rig.own) == (("mount",), ())
+
+
+@pytest.mark.parametrize(
+    ("stood", "stations"),
+    [
+        ("[0, 0, 1.5]", ((0.0, 0.0, 1.5),)),
+        ("[[0, 0, 1.5], [4, 2, 1]]", ((0.0, 0.0, 1.5), (4.0, 2.0, 1.0))),
+        ("[]", ()),
+    ],
+)
+def test_the_scanner_stood_at_one_station_at_several_or_nowhere_known(write, stood, stations):
+    mesh = "mesh: reference/mesh.ply"
+    rig = load_rig(write((mesh, f"{mesh}\n  scanner_m: {stood}")))
+    assert rig.reference.scanner_m == stations
 
 
 def test_frames_and_arm_make_one_chain(write):
@@ -188,6 +203,10 @@ def test_a_lidar_model_may_lie_beside_the_rig(write):
         (
             ("reference/mesh.ply", "reference/msh.ply"),
             r":22: reference\.mesh: .*msh\.ply does not exist",
+        ),
+        (
+            ("sigma_m: 0.0006\n", "sigma_m: 0.0006\n  scanner_m: [[0, 0, 1.5], [1, 2]]\n"),
+            r":24: reference\.scanner_m\.1\.2 is missing",
         ),
     ],
 )
