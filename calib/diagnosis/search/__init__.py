@@ -135,7 +135,7 @@ def search(stand: Stand, progress: Progress, most: int = MOST_NEEDED) -> Search:
             looks, found = _left_behind([*looks, look], found)
         else:
             looks, found, left = steps = _steps(beside, progress, most)
-            if instead := _in_place_of_chance(stand, plain[0][0], steps, progress, most):
+            if instead := _in_place_of_chance(stand, plain, steps, progress, most):
                 (looks, found, left), chance = instead, []
                 continue
         effects = [e for e in as_much if e.family not in {s.effect.family for s in found}]
@@ -281,12 +281,16 @@ def _chance_leads(look: Look) -> bool:
 
 
 def _in_place_of_chance(
-    stand: Stand, first: Look, beside: Steps, progress: Progress, most: int
+    stand: Stand, plain: Steps, beside: Steps, progress: Progress, most: int
 ) -> Steps | None:
     """What is named from the fit of a stand and effects that were named beside values by chance,
-    without these, if that is all there is: such values take in an effect that differs by stop."""
+    without these, if that is all there is: such values take in an effect that differs by stop.
+    Nothing where the plain steps, which left something to find, began with the same names."""
+    (first, *_), named, wild = plain
     _, found, left = beside
-    if not 0 < len(found) < most:
+    names = [step.effect.name for step in found]
+    begun_so = names == [step.effect.name for step in named[: len(found)]]
+    if not 0 < len(found) < most or (begun_so and not (wild or left)):
         return None
     bare = tried(stand.with_effects, [step.effect for step in found], progress)
     if bare is None:
