@@ -17,8 +17,8 @@ from calib.residuals.beams import Rows
 from calib.residuals.robust import TUKEY, tukey_cost
 from calib.residuals.scan import ScanStop
 from calib.residuals.surfaces import MeshSurface
-from calib.solve.loop import HOPELESS, STRAYED, Loop
-from calib.solve.torn import CONTRADICTS, borne_out, torn
+from calib.solve.loop import HOPELESS, Loop
+from calib.solve.torn import CONTRADICTS, STRAYED, borne_out, torn
 from chains.errors import NothingMetError
 
 SETTLED_STEP = 1e-4  # m and rad: then triangles that beams meet are kept; a choice, 1 mm at 10 m

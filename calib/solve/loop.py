@@ -9,21 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from calib.linear.layout import StopKey, key_of
-from calib.linear.parallel import over_stops
 from calib.outputs.journal import Answer
 from calib.problem.prior import JointPrior
 from calib.problem.problem import Block, Problem
 from calib.problem.spread import by_chance, widening, with_spread
 from calib.problem.surfaces import well_seen, with_surfaces
 from calib.problem.unknowns import Unknown
-from calib.residuals.beams import Association
-from calib.residuals.scan import ScanStop
 from calib.solve.added import anew, begun, rejected
 from calib.solve.components import squares, wider
 from calib.solve.components.told import sds, told
@@ -31,14 +27,9 @@ from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, Descent, Progr
 from calib.solve.estimate import DOFS, SEEN, Estimate, Start, started, values_of
 from calib.solve.graph import Graph
 from calib.solve.reweight import SETTLED_WEIGHT, reweighted
-from calib.solve.torn import doubted
-from chains import se3
+from calib.solve.torn import doubted, strayed
 
 CONVERGED = 1e-6  # m and rad: a tenth of the smallest sigmas, and the next step is smaller still
-# A scan that moved further, m and rad, looks anew what its beams meet: a choice; if these tell it
-# by more than so many sigmas. Scans along a corridor, of which nothing but its bumps tells, moved
-# by 18 mm from look to look, 0.7 to 2.1 sigmas; 22 to 43 before it was known what they meet.
-STRAYED, STRAYED_SIGMAS = 3e-3, 3.0
 # By how much a step still lowers half the chi-square where the robust scales alone keep a fit from
 # its end: by the one, or by the other share of it. It was 0.002 to 0.010 in 4 of 50 recordings with
 # a structured error and 400 beams a stop, so ten times that; and up to 2e-4 of it where 12 stops
@@ -283,14 +274,8 @@ class Loop(Descent):
         self.settle(tolerance, *(() if self.strayed() else (self.seen, self._met())))
 
     def strayed(self) -> bool:
-        """Whether a scan has moved far since it took what its beams meet, and further than its
-        beams leave open: along a corridor, what they meet there is as good as what they met."""
-        pairs = zip(self.problem.scans, self.associations, strict=True)
-        steps = (se3.log(se3.inverse(s.pose(self.seen)) @ s.pose(self.values)) for s, _ in pairs)
-        far = [(i, d) for i, d in enumerate(steps) if np.abs(d).max() >= STRAYED]
-        scans = [self.problem.scans[i] for i, _ in far]
-        met, moved = [self.associations[i] for i, _ in far], [d for _, d in far]
-        return any(over_stops(partial(_beyond_doubt, self.values), scans, met, moved))
+        """Whether a scan has moved far since it took what its beams meet."""
+        return strayed(self.problem.scans, self.associations, self.seen, self.values)
 
     def rows_hopeless(self) -> bool:
         """Whether rows of trackers and targets, as weighed, were hopelessly wide a step ago."""
@@ -393,13 +378,3 @@ class Loop(Descent):
             linear=self.linear if whole else None,
             seen=self.seen,
         )
-
-
-def _beyond_doubt(
-    values: Mapping[str, np.ndarray], scan: ScanStop, met: Association, moved: np.ndarray
-) -> bool:
-    """Whether the beams of a scan, what they meet being known, tell where it is now from where it
-    was before it moved so far (6,)."""
-    rows = scan.rows(values, met)
-    away = rows.by_twist @ moved / rows.sigma_m
-    return float(np.sqrt(rows.weight @ np.square(away))) > STRAYED_SIGMAS

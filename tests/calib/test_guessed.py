@@ -17,7 +17,7 @@ from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
 from calib.simulation import Spec
 from calib.solve.fit import solve
-from calib.solve.loop import _beyond_doubt
+from calib.solve.torn import _beyond_doubt
 from chains import se3
 from tests.worlds import World, write
 from tests.worlds.beams import model

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from calib.diagnosis import search as steps
+from calib.diagnosis import search as searching
 from calib.diagnosis.candidates import shape_limits
-from calib.diagnosis.search import nameless, search
+from calib.diagnosis.search import MOST_NEEDED, nameless, search, steps
 from calib.diagnosis.search.named import NamedEffect, Rival
 from calib.diagnosis.search.shapes import retuned
 from calib.diagnosis.verdict.matters import Consequences
@@ -19,6 +19,7 @@ from calib.problem.model import Model
 from calib.runs.calibrate import calibrate
 from calib.runs.reopen import stand_of
 from chains import se3
+from chains.errors import InputError
 
 from ..bench import arm_effects
 from . import arm_worlds
@@ -127,7 +128,7 @@ def test_a_name_that_is_nothing_beside_scatter_is_dropped(tmp_path):
     assert shift.test.statistic > 50.0  # in squared sigmas, of six parameters
     beside = done.looks[-1].stand.with_effects([shift.effect], quiet).look(quiet)
     named = [SimpleNamespace(candidate=shift, effect=shift.effect)]
-    look, kept = steps._outlasting(beside, named, quiet)
+    look, kept = searching._outlasting(beside, named, quiet)
     assert not kept and "mesh_shift" not in look.stand.model.names
     # Were it left, and taken away later, scatter would be what it is without it: in a fit from the
     # same state, as the search's last one weighs three spheres as it did before they scattered.
@@ -267,3 +268,20 @@ def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
     assert len(sizes) == 2
     for (_, x), size_m in zip(sorted(sizes.items()), (1e-3, -2e-3), strict=True):
         assert x[3] == pytest.approx(size_m, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("names", "wild", "fits"),
+    [(["a"], [], 0), (["a", "b"], [], 0), (["b"], [], 1), (["a"], [0], 1)],
+)
+def test_names_that_led_nowhere_are_not_fitted_again(names, wild, fits):
+    asked = []
+
+    def fitted(effects, progress):
+        asked.append([effect.name for effect in effects])
+        raise InputError("no fit comes of this")
+
+    beside = [], [SimpleNamespace(effect=SimpleNamespace(name=name)) for name in names], wild
+    stand, nowhere = SimpleNamespace(with_effects=fitted), [["a", "b"]]
+    assert searching._in_place_of_chance(stand, None, beside, quiet, MOST_NEEDED, nowhere) is None
+    assert asked == [names] * fits
