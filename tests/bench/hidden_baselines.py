@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 from scipy import stats
-from scipy.sparse import csr_array
 
 from calib.diagnosis.candidates import known_effects
 from calib.diagnosis.score import GAUGE, Scores, project, score_test
@@ -57,7 +56,7 @@ def without_mesh_errors(stand: Stand, effects: Sequence[Effect]) -> Scores:
     )
     linear, _, _ = replace(stand, estimate=bare).linearise(effects, silent)
     none = np.full(1, -1)
-    whole = csr_array(linear.gradient.sum(axis=0)[None])
+    whole = linear.gradient.sum(axis=0)[None]
     return project(replace(linear, gradient=whole, stop=none, place=none), linear.candidates)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from .hidden_baselines import NAMES
+from .hidden_baselines import NAMES
 from .hidden_cases import Case, case, cases, record
 from .hidden_effects import run
 from .hidden_table import hangs, named, table
@@ -36,8 +37,9 @@ def small(family: str, number: int = 0, **fields: object) -> Case:
     "number", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3))]
 )
 def test_nothing_is_found_where_nothing_is_hidden(number):
-    result = run(small("null", number), baselines=False)
+    result = run(small("null", number), baselines=number == 0)
     assert result["verdict"] == "adequate", result["steps"]
+    assert set(result["baselines"]) == (set(NAMES) if number == 0 else set())
     assert result["untestable"]["range_offset"].startswith("not identifiable")
 
 
