@@ -127,7 +127,7 @@ def lasso(scores: Scores, at: Columns, rows: int) -> list[str]:
     """The lasso over all candidates' columns, its penalty by BIC; what explains most first."""
     columns = np.concatenate(list(at.values()))
     family = np.repeat([e.family for e in at], [len(c) for c in at.values()])
-    seen = np.diag(scores.information)[columns] > GAUGE * np.diag(scores.whole)[columns]
+    seen = np.diag(scores.information)[columns] > GAUGE * scores.felt[columns]
     columns, family = columns[seen], family[seen]
     size = np.sqrt(np.diag(scores.information)[columns])
     gram = scores.information[np.ix_(columns, columns)] / np.outer(size, size)

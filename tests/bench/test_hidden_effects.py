@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from .hidden_baselines import NAMES
-from .hidden_baselines import NAMES
 from .hidden_cases import Case, case, cases, record
 from .hidden_effects import run
 from .hidden_table import hangs, named, table
