@@ -104,12 +104,13 @@ def apply(
         "clouds": [
             {"file": str(a.path), "points": a.points, "moved_rms_mm": 1e3 * a.rms_m}
             | {"not_corrected": a.left_out, "extrapolated": list(a.extrapolated)}
+            | {"remarks": list(a.remarks)}
             for a in done
         ],
     }
     lines = [*opened.doubts, *opened.omissions, *opened.found_wrong]
     for a in done:
-        lines += a.extrapolated
+        lines += [*a.remarks, *a.extrapolated]
         lines.append(f"wrote {a.path}: {a.points} points, moved by {1e3 * a.rms_m:.2f} mm rms")
         lines += [f"  not corrected: {name}, which {why}" for name, why in a.left_out.items()]
     say(document, "\n".join(lines), as_json)

@@ -6,7 +6,7 @@ Scans of a recording are corrected stop by stop, by whoever works on stops.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from calib.linear.parallel import one_blas_thread, over_stops
 from calib.linear.rows import State
 from calib.problem.model import Source
 from calib.residuals.scan import ScanStop
+from calib.rig import Rig, load_rig
 from calib.runs.reopen import identity, problem_of, reopened, state_of
 from calib.runs.run import Run
 from calib.solve.estimate import values_of
@@ -33,13 +34,15 @@ from sensors.recording import digest, read_table, table_bytes, write_table
 @dataclass(frozen=True)
 class Applied:
     """A cloud or recording that was corrected: where, how many points, by how much, what was left
-    out, and which effects went beyond where they were seen, a sentence each."""
+    out, which effects went beyond where they were seen, and what else is to be known, a sentence
+    each."""
 
     path: Path
     points: int
     rms_m: float
     left_out: dict[str, str]
     extrapolated: Sequence[str] = ()
+    remarks: Sequence[str] = ()
 
 
 @one_blas_thread
@@ -65,7 +68,7 @@ def apply(
 
     Raises:
         InputError: a cloud cannot be read, or would be written over, or the run has not converged;
-            or two clouds have one name.
+            or two clouds have one name; or a recording's LiDAR is another model than the run's.
     """
     run.refuse_unconverged(force)
     out, done, clouds = Path(out), [], outputs.each(clouds)
@@ -81,8 +84,10 @@ def apply(
         kept = outputs.kept(folder, asked)
         for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
             if cloud.is_dir():
+                remarks = tuple(_of_another_rig(correction.rig, cloud, run))
                 stops = _of_recording(run, cloud)
                 one = _apply_recording(correction, stops, cloud, folder / name, kept, progress)
+                one = replace(one, remarks=remarks)
             else:
                 progress("correcting", i, len(clouds))
                 one = _apply_file(correction, cloud, folder / name)
@@ -97,6 +102,23 @@ def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
     rms_m, left_out = correct(correction, cloud, columns, reach)
     (write_table if parquet else write_cloud)(target, columns)
     return Applied(target, len(columns["x"]), rms_m, left_out, extrapolated=reach.sentences())
+
+
+def _of_another_rig(mine: Rig, folder: Path, run: Run) -> Iterator[str]:
+    """That a recording is of another rig than the run's, where its name or its joints say so."""
+    theirs = load_rig(folder)
+    if theirs.lidar is None or theirs.lidar.name != mine.lidar.name:
+        has = f"has {theirs.lidar.name}" if theirs.lidar else "has no LiDAR"
+        raise InputError(
+            f"{folder} {has}, and {run.folder} is of {mine.lidar.name}; give a run of its LiDAR"
+        )
+    if theirs.name != mine.name:
+        differ = f"is of rig {theirs.name}, and {run.folder} of {mine.name}"
+    elif theirs.joint_names != mine.joint_names:
+        differ = f"is of an arm with other joints than that of {run.folder}"
+    else:
+        return
+    yield f"{folder} {differ}: its scans are corrected rightly only if it has the same LiDAR"
 
 
 @dataclass(frozen=True)

@@ -241,3 +241,30 @@ def test_a_run_without_a_lidar_corrects_nothing(tmp_path):
     run = calibrate([tmp_path / "rec"], tmp_path / "run", hold_out="none")
     with pytest.raises(InputError, match="this rig has no LiDAR"):
         Correction.of(Run.open(run.folder))
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "said"),
+    [
+        ("name: husky-lwa4p", "name: other", "is of rig other-hesai_pandarqt64, and "),
+        ("", "", None),
+    ],
+)
+def test_a_recording_of_another_rig_is_told(fitted, tmp_path, was, now, said):
+    whole, _, run = fitted
+    other = shutil.copytree(whole.recording.folder.parent / "unseen", tmp_path / "unseen")
+    text = (other / "rig.yaml").read_text()
+    assert was in text
+    (other / "rig.yaml").write_text(text.replace(was, now))
+    (done,) = apply(run, [other], tmp_path / "out")
+    assert [said in each for each in done.remarks] == ([True] if said else [])
+
+
+def test_a_recording_of_another_lidar_is_refused(fitted, tmp_path):
+    whole, _, run = fitted
+    other = shutil.copytree(whole.recording.folder.parent / "unseen", tmp_path / "unseen")
+    text = (other / "rig.yaml").read_text()
+    (other / "rig.yaml").write_text(text.replace("hesai_pandarqt64", "ouster_os1_64"))
+    with pytest.raises(InputError, match=r"unseen has .*64.*, and .*run is of .*; give a run of"):
+        apply(run, [other], tmp_path / "out")
+    assert not (tmp_path / "out").exists()

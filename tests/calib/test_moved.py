@@ -12,7 +12,7 @@ from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Key, Unknown
 from calib.recalibration.letgo import let_go
 from calib.recalibration.newer import RefittedPrior
-from calib.runs.asked.moved import _apart, _differences, moved
+from calib.runs.asked.moved import _apart, _differences, _models_differ, moved
 from calib.runs.asked.pair import Covariances, Pair, unknowns_of
 from calib.runs.belief import cautions, forbids
 from calib.runs.calibrate import calibrate
@@ -331,3 +331,22 @@ def test_the_command_says_it(runs, rigcal):
     assert told["relation"] == "independent" and len(told["links"]) == 9
     code, out, _ = rigcal("moved", a, grown)
     assert code == 0 and "no estimate differs significantly" in out
+
+
+def test_runs_of_different_arms_are_told_from_runs_of_one():
+    """Of a recording that shows fewer labels, or of a joint that was fixed, nothing is said."""
+
+    def run(name, *keys, fixed=()):
+        model = {"recordings": [{"rig": "lab"}], "fixed": fixed}
+        solution = SimpleNamespace(keys=[Key(*key) for key in keys])
+        return SimpleNamespace(folder=name, effects=[], model=model, solution=solution)
+
+    zeros = [("arm_joint_offset", f"joint_{n}") for n in range(1, 7)]
+    label = ("moved_surface", "3_chair")
+    six, four = run("six", *zeros, label), run("four", *zeros[:4])
+    named = ", ".join(".".join(zero) for zero in zeros[4:])
+    assert list(_models_differ(six, four)) == [
+        f"Only six has {named}: the two are of different arms"
+    ]
+    held = run("held", *zeros[1:], ("moved_surface", "4_bin"), fixed=[".".join(zeros[0])])
+    assert not list(_models_differ(six, held))

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc
 
+from calib.effects import GEOMETRY
 from calib.problem.prior import JointPrior
 from calib.recalibration.letgo import ALARM, let_go
 from calib.recalibration.links import Link
@@ -36,6 +37,7 @@ PRIOR, INDEPENDENT, SHARED = "prior", "independent", "shared"  # how two runs go
 # A fit ends where a step would lower half the chi-square by less than LAST: by so much of its
 # variance may an estimate be off, and so by twice as much the difference of two.
 UNSETTLED = 4 * LAST
+NAMED_ALONE = 3  # parameters of one arm alone: a choice
 
 
 @dataclass(frozen=True)
@@ -169,6 +171,13 @@ def _models_differ(a: Run, b: Run) -> Iterator[str]:
     rigs = [list(dict.fromkeys(r["rig"] for r in run.model["recordings"])) for run in (a, b)]
     if rigs[0] != rigs[1]:
         yield f"The rigs have different names: {', '.join(rigs[0])}, and {', '.join(rigs[1])}"
+    for one, other in ((a, b), (b, a)):
+        theirs, held = {*other.solution.keys}, {*other.model["fixed"]}
+        of_both = {key.unknown for key in theirs} & {*GEOMETRY}
+        alone = [k for k in one.solution.keys if k.unknown in of_both and k not in theirs]
+        if own := [key.name for key in alone if key.name not in held]:
+            named = ", ".join(own[:NAMED_ALONE]) + (", …" if len(own) > NAMED_ALONE else "")
+            yield f"Only {one.folder} has {named}: the two are of different arms"
 
 
 def _shared(a: Run, b: Run, bounds: Sequence[str], links: int) -> Iterator[str]:
