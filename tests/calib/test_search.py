@@ -246,6 +246,41 @@ def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
     assert (found, asked) == (([], []) if sure == "kept" else ([rival], [(rival, sure)]))
 
 
+@pytest.mark.parametrize(
+    ("costs", "converged", "named"),
+    [
+        ({"arm_joint_scale": 95.0, "arm_joint_coupling": 93.0}, True, "arm_joint_coupling"),
+        ({"arm_joint_scale": 98.0, "arm_joint_coupling": 97.5}, True, None),  # not by 20 to 1
+        ({"arm_joint_scale": 95.0, "arm_joint_coupling": 93.0}, False, None),
+        ({"arm_joint_scale": 95.0}, True, "arm_joint_scale"),  # the other is not confirmed
+    ],
+)
+def test_of_rivals_that_explain_more_the_fits_decide(monkeypatch, costs, converged, named):
+    def step_of(name, cost, rivals=()):
+        estimate = SimpleNamespace(robust_cost=cost - 2, converged=converged)
+        return NamedEffect(
+            candidate=SimpleNamespace(test=SimpleNamespace(dof=2), effect=find(name)),
+            before=SimpleNamespace(stand=SimpleNamespace(model=Model())),
+            after=SimpleNamespace(stand=SimpleNamespace(estimate=estimate)),
+            judged=None,
+            p_adjusted=0.01,
+            rivals=rivals,
+        )
+
+    def fitted(look, candidate, found, progress, sure):
+        name = candidate.effect.name
+        return [step_of(name, costs[name])] if name in costs else []
+
+    names = {"arm_joint_scale": -4.3, "arm_joint_coupling": -4.2, "arm_link_bending": -1.0}
+    rivals = [
+        Rival(SimpleNamespace(effect=find(name)), log_odds=odds, more=0.0)
+        for name, odds in names.items()
+    ]
+    monkeypatch.setattr(steps, "_fitted", fitted)
+    found = steps._by_likelier(None, step_of("arm_gravity_sag", 100.0, rivals), [], None)
+    assert [step.effect.name for step in found] == ([named] if named else [])
+
+
 def test_what_slips_in_two_rigs_has_one_time_and_each_its_own_size(tmp_path):
     """A mount is of one rig, so its slip is estimated for each; the time, for both together."""
     rng, poses, first = np.random.default_rng(3), 60, 33

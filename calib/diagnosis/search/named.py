@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.score import ScoreTest
-from calib.diagnosis.screen import Candidate, rivals
+from calib.diagnosis.screen import ODDS, Candidate, rivals
 from calib.diagnosis.search.parts import likeliest_part
 from calib.diagnosis.stand import Look
 from calib.effects import Effect
@@ -98,6 +98,22 @@ class NamedEffect:
         every = (rival for rival in self.rivals if not one_more_wave(rival.effect, model))
         best = max(every, key=lambda rival: rival.more, default=None)
         return best.candidate if best and best.more > FAR_MORE else None
+
+    @property
+    def doubted_by(self) -> list[Candidate]:
+        """Rivals that are expected to predict other rows far better than the named effect, none of
+        them one more wave; best first."""
+        model = self.before.stand.model
+        every = (rival for rival in self.rivals if not one_more_wave(rival.effect, model))
+        better = [rival for rival in every if rival.log_odds < -ODDS]
+        return [rival.candidate for rival in sorted(better, key=lambda rival: rival.log_odds)]
+
+    @property
+    def cost(self) -> float:
+        """Of the fit with it, half the robust chi-square and one for each of its parameters, by
+        which rows that it was not fitted to are expected to be less likely: as of
+        `Explained.log_score`."""
+        return self.after.stand.estimate.robust_cost + self.candidate.test.dof
 
     def with_effect(self, effect: Effect | None) -> NamedEffect:
         """With another shape of its effect, if there is one."""

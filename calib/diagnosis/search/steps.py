@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.candidates import one_more_wave
-from calib.diagnosis.screen import Candidate
+from calib.diagnosis.screen import ODDS, Candidate
 from calib.diagnosis.search.confirmed import ALPHA_EFFECT, judged, suspects
 from calib.diagnosis.search.mishaps import adapted, blunders_alone, restored
 from calib.diagnosis.search.named import NamedEffect, rivals_of
@@ -23,6 +23,7 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
+MOST_FITTED = 3  # rivals of a name: a choice, as each takes a fit and a look
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
 
@@ -104,9 +105,27 @@ def _by_likelier(
     """
     likelier = step.likelier
     if likelier is None:
-        return []
+        return _by_fits(look, step, found, progress)
     sure = step.p_adjusted if likelier.test.dof <= step.candidate.test.dof else None
     return _fitted(look, likelier, found, progress, sure=sure)
+
+
+def _by_fits(
+    look: Look, step: NamedEffect, found: list[NamedEffect], progress: Progress
+) -> list[NamedEffect]:
+    """What was found, and of the rivals that explain more than the effect just named the one that
+    fits best, if it also fits far better once both are fitted; nothing where none does.
+
+    Four effects of an arm's joints may do nearly the same at a few poses, and a test that leaves
+    out stops confirms that of fewest parameters. Links are then off by what tells it from the
+    others.
+    """
+    best, least = list[NamedEffect](), step.cost - ODDS
+    for candidate in step.doubted_by[:MOST_FITTED]:
+        more = _fitted(look, candidate, found, progress, sure=step.p_adjusted)
+        if more and more[-1].after.stand.estimate.converged and more[-1].cost < least:
+            best, least = more, more[-1].cost
+    return best
 
 
 def _one_for_all(
