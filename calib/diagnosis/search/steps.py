@@ -23,7 +23,7 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
-MOST_FITTED = 3  # rivals of a name: a choice, as each takes a fit and a look
+RIVALS_FITTED = 3  # rivals of a name: a choice, as each takes a fit and a look
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
 
@@ -120,12 +120,11 @@ def _by_fits(
     out stops confirms that of fewest parameters. Links are then off by what tells it from the
     others.
     """
-    best, least = list[NamedEffect](), step.cost - ODDS
-    for candidate in step.doubted_by[:MOST_FITTED]:
-        more = _fitted(look, candidate, found, progress, sure=step.p_adjusted)
-        if more and more[-1].after.stand.estimate.converged and more[-1].cost < least:
-            best, least = more, more[-1].cost
-    return best
+    some = step.doubted_by[:RIVALS_FITTED]
+    every = (_fitted(look, each, found, progress, sure=step.p_adjusted) for each in some)
+    ended = [more for more in every if more and more[-1].after.stand.estimate.converged]
+    best = min(ended, key=lambda more: more[-1].cost, default=[])
+    return best if best and best[-1].cost < step.cost - ODDS else []
 
 
 def _one_for_all(
