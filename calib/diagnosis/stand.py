@@ -106,10 +106,14 @@ class Stand:
         return self.refitted(self.model.minus(names), self.estimate.start, progress)
 
     def without(
-        self, groups: Sequence[Group], progress: Progress, of: Stand | None = None
+        self,
+        groups: Sequence[Group],
+        progress: Progress,
+        of: Stand | None = None,
+        aside: Collection[str] | None = None,
     ) -> Stand:
         """The model fitted from here, with some groups of rows left out: of what this fit was made
-        of, or `of` what another one was."""
+        of, or `of` what another one was. What it had set `aside` may be given in tokens."""
         of = of or self
         tokens = [group.token for group in groups]
         sources = leave_out(of.sources, tokens)
@@ -118,7 +122,9 @@ class Stand:
         if of is not self or any(group.kind == "surface" for group in groups):  # other surfaces
             meetings = {i: m for i, m in meetings.items() if sources[i].reference is None}
         problem = problems.build(sources, model, meetings=meetings)
-        estimate = solve(problem, progress=progress, start=self.estimate.start)
+        start = self.estimate.start
+        start = start if aside is None else replace(start, aside=frozenset(aside))
+        estimate = solve(problem, progress=progress, start=start)
         return Stand(sources, model, problem, estimate, own=self.own)
 
     def refitted(self, model: Model, start: Start, progress: Progress) -> Stand:

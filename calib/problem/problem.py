@@ -150,7 +150,9 @@ class Problem:
         """The problem with these scans and bodies, and no others, set aside; see `Group.token`."""
         if self.set_aside == set(tokens):
             return self
-        every = [*self.scans, *self.aside]
+        order = {source.recording.folder: i for i, source in enumerate(self.sources)}
+        every = [*self.scans, *self.aside]  # in the order of their stops, as when built
+        every.sort(key=lambda scan: (order[scan.recording.folder], scan.index))
         kept = [scan for scan in every if scan.group.token not in tokens]
         gone = [scan for scan in every if scan.group.token in tokens]
         blocks = [

@@ -39,6 +39,7 @@ from calib.results.rings import documents as odd_rings
 from calib.results.sigmas import misfit, widened
 from calib.results.solution import solution_of, up_of, zeros_of
 from calib.results.stages import FIT, staged
+from calib.runs.asked.in_place import rivals_told
 from calib.runs.belief import limits
 from calib.runs.reopen import (
     effects_of_prior,
@@ -238,8 +239,7 @@ def _fit(
     start: Start | None = None,
 ) -> None:
     """Estimate, judge by what was held out, and write the run."""
-    began, progress = time.monotonic(), staged(progress, FIT)
-    before = choices.before
+    began, before, progress = time.monotonic(), choices.before, staged(progress, FIT)
     problem = problems.build(sources, model, progress=progress)
     held = earlier(problem, before.solution, before.rests_on) if before else None
     links: list[Link] = []
@@ -277,12 +277,13 @@ def _fit(
     reached = reach(freed.problem, freed, known)
     summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
     summary |= {"sigmas_widened_by": known.least, "cad_widened_by": known.cad, "held_out_by": unit}
-    summary |= {"without": list(model.without), "extrapolated": seen_at.sentences()}
-    summary |= {"intervals_wider_by": calibration.document(solution.names)}
+    summary |= {"rivals": rivals_told(choices.grown_from), "without": list(model.without)}
+    summary["intervals_wider_by"] = calibration.document(solution.names)
+    summary["extrapolated"] = seen_at.sentences()
     summary |= {"rings": odd_rings(sources), "set_aside": sorted(estimate.problem.set_aside)}
     summary["predicted_mm"] = reached.document(summary) if reached else None
-    summary |= {"up": up} if (up := up_of(estimate, known)) else {}
-    summary |= {"level_zeros": zeros} if (zeros := zeros_of(estimate, known)) else {}
+    levels = {"up": up_of(estimate, known), "level_zeros": zeros_of(estimate, known)}
+    summary |= {name: told for name, told in levels.items() if told}
     summary["seconds"] = time.monotonic() - began
     write_json(folder / SUMMARY, summary)
     warning = Run(folder, document, summary, solution).warning

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,17 +17,15 @@ from calib.diagnosis.rejects import Rejects, rejects
 from calib.diagnosis.search import Search, beside_formulas, nameless, search
 from calib.diagnosis.search.confirmed import structures
 from calib.diagnosis.stand import Look, Stand, tried
-from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis, conclude
+from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, unchecked, weighed
 from calib.diagnosis.verdict.names import believed
-from calib.diagnosis.verdict.sentences import BAD
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
-from calib.diagnosis.weak import group, to_be_planned, to_be_told_apart, weak_directions
+from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects.reference import FaroScale
 from calib.linear.parallel import one_blas_thread
 from calib.outputs.journal import going_on
-from calib.problem.model import default_effects
 from calib.problem.spread import names_of
 from calib.recalibration.between import contradictions
 from calib.residuals.groups import MESH, Group
@@ -40,6 +37,13 @@ from calib.results.rings import detectable, misnumbered
 from calib.results.sigmas import TOLERATED
 from calib.results.stages import DIAGNOSE as DIAGNOSE_STAGES
 from calib.results.stages import staged
+from calib.runs.asked.commands import (
+    can_be_planned_for,
+    command_to_plan,
+    next_command,
+    remedies,
+)
+from calib.runs.asked.in_place import InPlace, in_place
 from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import identity, stand_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -112,31 +116,45 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
         ],
         formulas,
     )
-    unseen = _reaches(found.looks[0], run) if run.converged else {}
-    last = found.beside or found.looks[-1]
+    result = replace(result, unseen=_reaches(found.looks[0], run) if run.converged else {})
+    described = bool(found.found or formulas.formulas)
     apart = to_be_told_apart(result.candidates, result.weak_directions)
+    others = [*in_place(run, stand, progress)] if result.verdict == "adequate" else []
     return replace(
         result,
-        plan=command_to_plan(run, apart) if apart and _planned_for(stand) else "",
-        remedies=list(remedies(run, result, _planned_for(stand))),
+        plan=command_to_plan(run, apart) if apart and can_be_planned_for(stand) else "",
+        remedies=list(remedies(run, result, can_be_planned_for(stand))),
         scatter=[*_scatter(run, stand), *result.scatter],
         detectable={**detectable(stand.sources), **_scale_detectable(result)},
-        unseen=unseen,
-        sentences=[
-            *run.doubts,
-            *suspect,
-            *result.sentences,
-            *(told.uneven(last.blunders) if run.converged else ()),
-            *unchecked(found.looks[0], run.solution),
-            *not_heard(run.solution.not_estimated),
-            *hardly_checked(unseen),
-            *_noisier(run, found.looks[-1].stand, bool(found.found or formulas.formulas)),
-            *map(told.whole, _cautions(run, result, last)),
-            *found.looks[0].linear.beams_drawn,
-            *run.omissions,
-        ],
-        command=_command(run, result),
+        in_place=[each.document() for each in others],
+        sentences=[*run.doubts, *suspect, *_said(run, found, result, others, described)],
+        command=next_command(run, result),
     )
+
+
+def _said(
+    run: Run, found: Search, result: Diagnosis, others: Sequence[InPlace], described: bool
+) -> Iterator[str]:
+    """The sentences of a diagnosis, and what else is to be said of its run.
+
+    Args:
+        run: the run.
+        found: the search.
+        result: what was concluded.
+        others: what would fit in place of effects that the model has.
+        described: whether names or formulas were found.
+    """
+    last, said = found.beside or found.looks[-1], result.sentences
+    yield from (*said[:1], *(each.sentence for each in others), *said[1:])
+    if run.converged:
+        yield from told.uneven(last.blunders)
+    yield from unchecked(found.looks[0], run.solution)
+    yield from not_heard(run.solution.not_estimated)
+    yield from hardly_checked(result.unseen)
+    yield from _noisier(run, found.looks[-1].stand, described)
+    yield from map(told.whole, _cautions(run, result, last))
+    yield from found.looks[0].linear.beams_drawn
+    yield from run.omissions
 
 
 def _rooms(stand: Stand) -> Iterator[dict[str, Any]]:
@@ -284,17 +302,6 @@ def _cautions(run: Run, found: Diagnosis, look: Look) -> list[str]:
     return [each for each in every if told.whole(each) not in said]
 
 
-def _command(run: Run, found: Diagnosis) -> str:
-    """What to do next: leave out what is wrong, or add what is missing."""
-    if tokens := told.tokens(found.blunders):
-        return command_without(run, tokens)
-    names = [*found.worth_adding, *found.formulas]
-    if found.verdict == BAD or not names:
-        return ""
-    out = f"{run.folder}-{'formula' if found.formulas else 'added'}"
-    return shlex.join(["rigcal", "add", str(run.folder), *names, "-o", out])
-
-
 def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
     """How widely things scatter by chance, as the run's model has it."""
     parts = [run.solution.shared, *run.solution.recordings.values()]
@@ -307,75 +314,6 @@ def _scatter(run: Run, stand: Stand) -> Iterator[dict[str, Any]]:
                 sd, sigma = each
                 spread = Spread(of=of[name], unit=unit, sd=sd, sigma=sigma)
                 yield spread.document(effect.name)
-
-
-def command_to_plan(run: Run, effects: Sequence[str]) -> str:
-    """The command that plans stops at which effects differ, and writes them beside the run, where
-    the workbench shows them."""
-    out = ["-o", f"{run.folder}-plan"]
-    return shlex.join(["rigcal", "plan", str(run.folder), "--for", ",".join(effects), *out])
-
-
-def remedies(run: Run, found: Diagnosis, stops: bool) -> Iterator[dict[str, Any]]:
-    """What would tell of what a diagnosis could not; see `Diagnosis`.
-
-    Args:
-        run: the run.
-        found: its diagnosis.
-        stops: whether stops can be planned for it.
-    """
-    told = [("undistinguished", group(c), _separate(c), to_be_planned(c)) for c in _tied(found)]
-    told += [
-        ("weak_direction", w["parameters"], w["needs"], [] if w["alike"] else w["parameters"])
-        for w in found.weak_directions
-    ]
-    told += [  # other rows want other columns
-        ("untestable", [name], why, [name] if why == ABSORBED_BY_MODEL else [])
-        for name, why in found.untestable.items()
-    ]
-    for of, names, needs, planned in told:
-        command = command_to_plan(run, planned) if stops and planned else None
-        yield {"of": of, "names": list(names), "needs": needs, "plan": command}
-
-
-def _separate(candidate: Mapping[str, Any]) -> str:
-    """What would separate a candidate from its rivals: of those that stops can tell it from, if
-    there are any."""
-    rivals = sorted(candidate["rivals"], key=lambda rival: rival["alike"])
-    return rivals[0]["separate"]
-
-
-def _tied(found: Diagnosis) -> list[Mapping[str, Any]]:
-    """Candidates that were confirmed and have rivals; not what scatters by chance, whose rivals are
-    told apart by other instruments and not by other stops."""
-    return [c for c in found.candidates if c["step"] and c["rivals"]]
-
-
-def _planned_for(stand: Stand) -> bool:
-    """Whether stops can be planned: the rig has an arm and, of scans, a mesh."""
-    source = stand.sources[0]
-    meets = source.reference is not None or not stand.problem.scans
-    return bool(source.rig.joint_names) and meets
-
-
-def command_without(run: Run, tokens: Sequence[str]) -> str:
-    """The command that fits a run's model to the same without some groups of rows."""
-    left_out = [*run.model.get("without", ()), *tokens]
-    without = [part for token in left_out for part in ("--without", token)]
-    effects = run.model["effects"]
-    out = ["-o", f"{run.folder}-without"]
-    if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
-        new = without[-2 * len(tokens) :]
-        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *run.trusting])
-    usual = None if run.prior else default_effects(run.recordings)
-    chosen = [] if tuple(effects) == usual else ["--effects", ",".join(effects)]
-    chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]
-    for key, as_a_rule in (("hold_out", "location"), ("folds", 1)):
-        if run.model[key] != as_a_rule:
-            chosen += [f"--{key.replace('_', '-')}", str(run.model[key])]
-    chosen += ["--prior", str(run.prior)] if run.prior else []
-    chosen += ["--beams", str(run.beams)] if run.beams else []
-    return shlex.join(["rigcal", "fit", *map(str, run.recordings), *out, *chosen, *without])
 
 
 def _scale_detectable(found: Diagnosis) -> dict[str, dict[str, float]]:

@@ -19,6 +19,7 @@ from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
 from calib.solve.otherwise.orientations import lidars_turned
 from calib.solve.otherwise.unseen import joints_by_scans
 from calib.solve.reweight import reweighted
+from calib.solve.torn import agreeing
 from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
 
@@ -68,6 +69,7 @@ def solve(
         loop.doubt_bodies()
     if loop.start.state and problem.scans:
         _go_on(loop, tolerance)
+        _take_back(loop, tolerance)
         _hear_rejected(loop, tolerance)
         return _not_raised(loop, loop.estimate(tolerance if spread else None))
     _without_scans(loop, problem, turns=prior is None)
@@ -143,6 +145,21 @@ def _go_on(loop: Loop, tolerance: float) -> None:
     loop.reweigh(beams=True)
     loop.settle_on(tolerance)
     _stay_below(loop, lambda: loop.descend(LAST, tolerance))
+
+
+def _take_back(loop: Loop, tolerance: float) -> None:
+    """Go on with scans that an earlier fit set aside and that contradict the others no more, as
+    where an effect was missing that put them so far off."""
+    if loop.lost or not loop.problem.aside:
+        return
+    seen, met = loop.seen, loop.met
+    back = agreeing(loop.problem.aside, loop.values, float(np.median(loop.here.scale)))
+    if not back:
+        return
+    loop.give(loop.given.setting_aside(loop.given.set_aside - back))
+    loop.settle(tolerance, seen, met)
+    loop.reweigh(beams=True)
+    loop.settle_on(tolerance)
 
 
 def _hear_rejected(loop: Loop, tolerance: float) -> None:

@@ -242,7 +242,8 @@ class Loop(Descent):
             out |= wider(self.problem, sums, self._earlier)
         return {key: np.float64(sd) for key, sd in out.items()}
 
-    def _met(self) -> dict[StopKey, np.ndarray]:
+    @property
+    def met(self) -> dict[StopKey, np.ndarray]:
         """What beams meet now."""
         pairs = zip(self.problem.scans, self.associations, strict=True)
         return {key_of(scan): association.part for scan, association in pairs}
@@ -271,7 +272,7 @@ class Loop(Descent):
 
     def settle_on(self, tolerance: float) -> None:
         """The same from here: scans keep what they met, unless one has moved far already."""
-        self.settle(tolerance, *(() if self.strayed() else (self.seen, self._met())))
+        self.settle(tolerance, *(() if self.strayed() else (self.seen, self.met)))
 
     def strayed(self) -> bool:
         """Whether a scan has moved far since it took what its beams meet."""

@@ -21,11 +21,12 @@ from calib.linear.parallel import over_stops
 from calib.problem.problem import Problem
 from calib.residuals.beams import Association
 from calib.residuals.groups import Group
+from calib.residuals.robust import robust_scale
 from calib.residuals.scan import ScanStop
 from calib.residuals.seen import BodiesTogether
 from calib.residuals.tracker import TrackedBody
 from chains import se3
-from chains.errors import InputError
+from chains.errors import InputError, NothingMetError
 
 # Bodies half of whose stops are so far (m, rad) from where the chain puts them after a fit are not
 # described by it: CAD and encoders are good to millimetres. Measured on the independent recordings:
@@ -181,6 +182,28 @@ def strayed(
     far = [(i, step) for i, step in enumerate(steps) if np.abs(step).max() >= STRAYED]
     some, known = [scans[i] for i, _ in far], [met[i] for i, _ in far]
     return any(over_stops(partial(_beyond_doubt, values), some, known, [step for _, step in far]))
+
+
+def agreeing(scans: Sequence[ScanStop], values: Mapping[str, np.ndarray], scale: float) -> set[str]:
+    """Tokens of those of some scans that contradict the others no more.
+
+    Args:
+        scans: that were set aside.
+        values: the state.
+        scale: how many sigmas wide the bulk of residuals is in most of the others.
+    """
+    found = over_stops(partial(_scale_of, values), scans)
+    pairs = zip(scans, found, strict=True)
+    return {scan.group.token for scan, own in pairs if own <= CONTRADICTS * scale}
+
+
+def _scale_of(values: Mapping[str, np.ndarray], scan: ScanStop) -> float:
+    """How many sigmas wide the bulk of a scan's residuals is; infinite where it meets nothing."""
+    try:
+        rows = scan.rows(values, None)
+    except NothingMetError:
+        return np.inf
+    return robust_scale((rows.residual_m / rows.sigma_m)[rows.usable])
 
 
 def _beyond_doubt(

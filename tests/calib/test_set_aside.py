@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from calib.effects import find
 from calib.evaluation import evaluate
 from calib.evaluation.apply import apply
+from calib.problem.model import Model
 from calib.report import report
 from calib.runs.add import add
 from calib.runs.calibrate import calibrate
@@ -13,6 +15,8 @@ from calib.runs.run import RESIDUALS, Run
 from calib.simulation import simulate
 from calib.view.scene import Scene
 from sensors.recording import read_table
+
+from .simulated import made
 
 pytestmark = pytest.mark.slow
 EXCHANGED = ("L00P00", "L03P02")
@@ -86,3 +90,32 @@ def test_they_are_corrected_like_any_other_scan(run, folder, tmp_path):
         points = [np.stack([t[c] for c in "xyz"], axis=1).astype(float) for t in (before, after)]
         moved_m = np.linalg.norm(points[1] - points[0], axis=1)
         np.testing.assert_allclose(moved_m, np.abs(offset_m[before["ring"]]), atol=2e-6)
+
+
+@pytest.fixture(scope="module")
+def sagging(tmp_path_factory):
+    """An arm that sags so much that a scan contradicts the others."""
+    folder = tmp_path_factory.mktemp("sagging")
+    made(folder / "rec", "tiny", seed=1, arm_gravity_sag=3.0)
+    run = calibrate([folder / "rec"], folder / "run", hold_out="none")
+    assert run.set_aside == ["L01P00:scan"]
+    return run
+
+
+def test_a_scan_that_a_missing_effect_put_far_off_is_taken_back(sagging, tmp_path):
+    """It stayed set aside with the effect in the model, and was called wrong."""
+    grown = add(sagging, "arm_gravity_sag", tmp_path / "grown")
+    assert grown.converged and not grown.set_aside
+    stops = {path.stem for path in (grown.folder / RESIDUALS).glob("[!_]*")}
+    assert "L01P00" in stops
+    model = Model(tuple(map(find, grown.effects)))
+    cold = calibrate(sagging.recordings, tmp_path / "cold", model, hold_out="none")
+    for name in grown.effects:
+        ours, theirs = (each.solution.shared.effects[name] for each in (grown, cold))
+        assert (np.abs(ours.estimate - theirs.estimate) <= 0.05 * theirs.sigma).all()
+
+
+@pytest.mark.long
+def test_such_a_scan_is_no_blunder_beside_the_effect(sagging):
+    found = diagnose(sagging, refits=False)
+    assert found.worth_adding == ["arm_gravity_sag"] and not found.blunders

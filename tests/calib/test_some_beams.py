@@ -9,7 +9,7 @@ import pytest
 
 import calib
 from calib.problem.model import Source
-from calib.runs.diagnose import command_without
+from calib.runs.asked.commands import command_without
 from calib.runs.ladder import ladder
 from calib.runs.reopen import reopened
 from calib.runs.reproduce import reproduce

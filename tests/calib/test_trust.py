@@ -14,8 +14,9 @@ import yaml
 
 from calib.effects import load_effects, trust_in
 from calib.problem.model import Model
+from calib.runs.asked.commands import command_without
 from calib.runs.calibrate import calibrate
-from calib.runs.diagnose import command_without, diagnose
+from calib.runs.diagnose import diagnose
 from calib.runs.run import MODEL, Run
 from calib.view.desk import Desk, Findings
 from calib.view.job import Change, Job

@@ -14,8 +14,8 @@ from calib.problem.without import leave_out
 from calib.report import report
 from calib.residuals.targets import TARGET_PARTS
 from calib.runs.add import add
+from calib.runs.asked.commands import command_without
 from calib.runs.calibrate import calibrate, grow
-from calib.runs.diagnose import command_without
 from calib.runs.reopen import model_of, reopened
 from calib.runs.run import Run
 from calib.view.scene import Scene

@@ -144,17 +144,21 @@ def restored(
     Returns:
         The last look with what is no blunder, what is one, and the effects.
     """
-    aside = [each.blunder.group for each in left if each.aside]
-    less = len(aside) < len(left)
-    if (stand := tried(last.stand.without, aside, progress, first) if less else None) is None:
+    aside = {each.blunder.group.token for each in left if each.aside}
+    if (stand := tried(last.stand.without, [], progress, first, aside) if left else None) is None:
+        return last, left, found
+    still = aside & stand.estimate.problem.set_aside
+    if len(still) == len(left):
         return last, left, found
     stand, swapped = retuned(stand, [step.effect.name for step in found], progress)
     look = stand.look(progress)
     loud = {blunder.group for blunder in look.blunders if blunder.found}
-    kept = [each for each in left if each.aside or each.blunder.group in loud]
+    kept = [
+        e for e in left if (e.blunder.group.token in still if e.aside else e.blunder.group in loud)
+    ]
     if len(kept) == len(left):
         return last, left, found
-    if len(kept) > len(aside):
+    if kept:
         groups = [each.blunder.group for each in kept]
         look = stand.without(groups, progress, of=first).look(progress)
     steps = [step.with_effect(swapped.get(step.effect.name)) for step in found]

@@ -122,7 +122,7 @@ def _by_fits(
     """
     some = step.doubted_by[:RIVALS_FITTED]
     every = (_fitted(look, each, found, progress, sure=step.p_adjusted) for each in some)
-    ended = [more for more in every if more and more[-1].after.stand.estimate.converged]
+    ended = (more for more in every if more and more[-1].after.stand.estimate.converged)
     best = min(ended, key=lambda more: more[-1].cost, default=[])
     return best if best and best[-1].cost < step.cost - ODDS else []
 

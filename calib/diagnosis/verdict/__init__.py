@@ -78,6 +78,7 @@ class Diagnosis:
             what it `needs`, and the command that plans such stops, None where no stops help.
         rejected: what the fit threw away; None without scans, or where nobody looked.
         scatter: how widely things scatter by chance, of the model and of what it lacks.
+        in_place: effects that would fit as well in place of one that the model has.
         detectable: of what is no group of rows: name -> unit -> least size of a mishap to be found.
         unseen: group of rows -> how far a mishap to it that is not found could move an estimate.
     """
@@ -99,6 +100,7 @@ class Diagnosis:
     remedies: Sequence[Mapping[str, Any]] = ()
     rejected: Rejects | None = None
     scatter: Sequence[Mapping[str, Any]] = ()
+    in_place: Sequence[Mapping[str, Any]] = ()
     detectable: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     unseen: Mapping[Group, FurthestMoved] = field(default_factory=dict, repr=False)
 
@@ -136,6 +138,7 @@ class Diagnosis:
             "command": self.command or None,
             "plan": self.plan or None,
             "remedies": list(self.remedies),
+            "in_place": list(self.in_place),
             **told.groups(self.groups, self.detectable, self.unseen),
             "scatter": list(self.scatter),
             "misfit": dict(self.misfit),

@@ -255,14 +255,18 @@ def _step_sentences(step: NamedEffect, candidate: Mapping[str, Any], worn: bool)
 
 def rival_sentence(rival: Mapping[str, Any]) -> str:
     """Of a rival of an effect, as `rivals` of diagnosis.json has it."""
-    odds = rival["odds"]
-    ratio = max(odds, 1.0 / max(odds, 1e-300))
-    many = "more than a million" if ratio > 1e6 else f"{ratio:,.{1 if ratio < 100 else 0}f}"
-    told = f"odds {many} to 1" if odds >= 1.0 else f"odds 1 to {many}"
+    told = odds_told(odds := rival["odds"])
     said = f"On these data it is not distinguishable from {rival['effect']} ({told})"
     if odds < np.exp(-ODDS):
         said = f"{rival['effect']} explains more ({told})"
     return f"{said}; {rival['separate']} would separate them."
+
+
+def odds_told(odds: float) -> str:
+    """Odds of one effect to another, in words."""
+    ratio = max(odds, 1.0 / max(odds, 1e-300))
+    many = "more than a million" if ratio > 1e6 else f"{ratio:,.{1 if ratio < 100 else 0}f}"
+    return f"odds {many} to 1" if odds >= 1.0 else f"odds 1 to {many}"
 
 
 def _residual(look: Look) -> str:
