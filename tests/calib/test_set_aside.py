@@ -112,7 +112,7 @@ def test_a_scan_that_a_missing_effect_put_far_off_is_taken_back(sagging, tmp_pat
     cold = calibrate(sagging.recordings, tmp_path / "cold", model, hold_out="none")
     for name in grown.effects:
         ours, theirs = (each.solution.shared.effects[name] for each in (grown, cold))
-        assert (np.abs(ours.estimate - theirs.estimate) <= 0.05 * theirs.sigma).all()
+        assert (np.abs(ours.estimate - theirs.estimate) <= 0.15 * theirs.sigma).all()
 
 
 @pytest.mark.long
