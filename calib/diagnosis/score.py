@@ -252,6 +252,23 @@ class ScoreTest:
         left_out = shares.left_out(pairs, mine @ self.whiten, self.chances[0].nu, self.spent)
         return replace(self, chances=(*self.chances, *left_out))
 
+    def at(self, own: np.ndarray, shares: Shares, scores: Scores) -> ScoreTest:
+        """The same of parameters that were fitted, with clusters left out one by one: these then
+        show what is fitted and, as scores, what that leaves.
+
+        Args:
+            own: (r,) the parameters, along the whitened directions.
+            shares: rows of the clusters along these.
+            scores: those that this test was made from.
+        """
+        told = np.array([(rows @ own) @ rows for rows in shares.rows]).reshape(-1, len(own))
+        pairs = np.stack([scores.stop, scores.place], axis=1)
+        pairs = np.concatenate([pairs, np.array(shares.pairs, int).reshape(-1, 2)])
+        whole = np.concatenate([scores.cells[:, self.columns] @ self.whiten, told])
+        left_out = shares.left_out(pairs, whole, self.chances[0].nu, self.spent)
+        score = scores.information[np.ix_(self.columns, self.columns)] @ self.whiten @ own
+        return replace(self, statistic=float(own @ own), score=score, chances=left_out)
+
     def p_value(self) -> float:
         """How often chance alone explains as much."""
         return at_least(self.chance.p_value(self.statistic))

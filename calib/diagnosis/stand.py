@@ -22,7 +22,7 @@ from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_of_pose, p_serial
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, beams_looked_at, linearise_with, rows_along
-from calib.diagnosis.score import ScoreTest, away_from_model, project
+from calib.diagnosis.score import Scores, ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.diagnosis.structure import of_look, singly, structure
 from calib.effects import CATALOGUE, Effect, Scatter, Site
@@ -350,6 +350,30 @@ class Look:
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows.A, rows.stop, rows.place)
         return found.judged(shares, self.named.scores)
+
+    def judged_as_fitted(self, effect: Effect, progress: Progress) -> ScoreTest:
+        """The test of an effect of this look's model at what it was fitted to, clusters left out
+        one by one: Wald's. Of an effect so large that beams are rejected for it, more at one stop
+        than at another, a test without it sees these stops differ."""
+        scores, theta = as_fitted(self, effect)
+        found = score_test(scores, np.arange(len(theta)))
+        own = found.whiten.T @ scores.information @ theta
+        away = away_from_model(self.linear, list(scores.at)) @ found.whiten
+
+        def tell(done: int, total: int) -> None:
+            progress("fitting the candidates", done, total)
+
+        shares, estimate = Shares(), self.stand.estimate
+        for rows in rows_along(self.linear, self.stand.problem, estimate, away, tell):
+            shares.add(rows.A, rows.stop, rows.place)
+        return found.at(own, shares, scores)
+
+
+def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
+    """Scores of the parameters of an effect of a look's model, and these parameters (Q,)."""
+    names = variables_of(look.stand.problem, {effect.name})[effect.name]
+    values = look.stand.estimate.values
+    return project(look.linear, names), np.concatenate([values[name] for name in names])
 
 
 def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:

@@ -10,9 +10,9 @@ from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, log_tail
 from calib.diagnosis.rejects import FEWEST_STOPS
-from calib.diagnosis.score import Scores, ScoreTest, project, score_test
+from calib.diagnosis.score import ScoreTest, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.stand import Look, variables_of
+from calib.diagnosis.stand import Look, as_fitted
 from calib.effects import Effect
 from calib.solve.fit import Progress
 
@@ -67,6 +67,14 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
     return found, float(after_looks(found.p_value(), candidate.looks))
 
 
+def judged_as_fitted(
+    look: Look, effect: Effect, looks: float, progress: Progress
+) -> tuple[ScoreTest, float]:
+    """The test of an effect of a look's model, and its p-value after so many looks; see `Look`."""
+    found = look.judged_as_fitted(effect, progress)
+    return found, float(after_looks(found.p_value(), looks))
+
+
 def anything(look: Look, progress: Progress) -> bool:
     """Whether any candidate is confirmed, in its best shape."""
     closest = (look.closely(each, progress) for each in suspects(look.named, ALPHA_EFFECT))
@@ -91,13 +99,6 @@ def outdoing(look: Look, statistic: float) -> list[Effect]:
     found = [c for c in look.named.candidates if 2.0 * c.evidence > statistic]
     found = [c for c in found if stands_out(c, ALPHA_EFFECT)]
     return [c.effect for c in found if found[0].evidence - c.evidence < ODDS]
-
-
-def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
-    """Scores of the parameters of an effect of a look's model, and these parameters (Q,)."""
-    names = variables_of(look.stand.problem, {effect.name})[effect.name]
-    values = look.stand.estimate.values
-    return project(look.linear, names), np.concatenate([values[name] for name in names])
 
 
 def suspects(screen: Screen, alpha: float) -> Iterator[Candidate]:

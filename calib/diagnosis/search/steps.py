@@ -12,7 +12,12 @@ from dataclasses import replace
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.screen import ODDS, Candidate
-from calib.diagnosis.search.confirmed import ALPHA_EFFECT, judged, suspects
+from calib.diagnosis.search.confirmed import (
+    ALPHA_EFFECT,
+    judged,
+    judged_as_fitted,
+    suspects,
+)
 from calib.diagnosis.search.mishaps import adapted, blunders_alone, restored
 from calib.diagnosis.search.named import NamedEffect, rivals_of
 from calib.diagnosis.search.shapes import retuned
@@ -23,6 +28,9 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
+# Of a test that does not confirm an effect, the p-value before all looks from which it is fitted,
+# and tested as it was fitted: by convention. Were all linear, that test would say the same.
+ASKED_AGAIN = 0.05
 RIVALS_FITTED = 3  # rivals of a name: a choice, as each takes a fit and a look
 
 Steps = tuple[list[Look], list[NamedEffect], list[LeftOut]]
@@ -162,7 +170,8 @@ def _fitted(
     if p >= ALPHA_EFFECT and finest.effect.jumps and finest is not candidate:
         p = min(p, 2.0 * judged(look, candidate, progress)[1])
     p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
-    if p >= ALPHA_EFFECT:
+    again = p >= ALPHA_EFFECT and not instead and test.p_value() < ASKED_AGAIN
+    if p >= ALPHA_EFFECT and not again:
         return []
     stand = tried(look.stand.with_effects, [finest.effect], progress)
     theta = stand.theta(finest.effect) if stand else 0 * finest.test.estimate()
@@ -172,6 +181,11 @@ def _fitted(
     names = [*(f.effect.name for f in found), finest.effect.name]
     stand, swapped = retuned(stand, names, progress)
     after = stand.look(progress)
+    if again:
+        there = swapped.get(finest.effect.name, finest.effect)
+        test, p = judged_as_fitted(after, there, finest.looks, progress)
+        if p >= ALPHA_EFFECT:
+            return []
     if instead and any(b.found for b in after.blunders):
         return []
     scale = max(after.named.common, test.inflation)
