@@ -28,8 +28,9 @@ FEWEST_ALIKE = 2  # stops with a blunder each, for one effect to be asked for in
 # Of what a test says of an effect, below which a fit does not bear it out: a choice, far below the
 # whole that it takes up where the test is right.
 HELD_BACK = 0.1
-# Of a test that does not confirm an effect, the p-value before all looks from which it is fitted,
-# and tested as it was fitted: by convention. Were all linear, that test would say the same.
+# Of a test that does not confirm an effect of the LiDAR, the p-value before all looks from which it
+# is fitted, and tested as it was fitted: by convention. Were no beams rejected for it, that test
+# would say the same, as it does of all other effects.
 ASKED_AGAIN = 0.05
 RIVALS_FITTED = 3  # rivals of a name: a choice, as each takes a fit and a look
 
@@ -170,7 +171,8 @@ def _fitted(
     if p >= ALPHA_EFFECT and finest.effect.jumps and finest is not candidate:
         p = min(p, 2.0 * judged(look, candidate, progress)[1])
     p = max((b.p_adjusted for b in instead), default=p if sure is None else min(p, sure))
-    again = p >= ALPHA_EFFECT and not instead and test.p_value() < ASKED_AGAIN
+    again = p >= ALPHA_EFFECT and not instead and finest.effect.of_lidar
+    again = again and test.p_value() < ASKED_AGAIN
     if p >= ALPHA_EFFECT and not again:
         return []
     stand = tried(look.stand.with_effects, [finest.effect], progress)
