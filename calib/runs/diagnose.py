@@ -43,7 +43,7 @@ from calib.runs.asked.commands import (
     next_command,
     remedies,
 )
-from calib.runs.asked.in_place import InPlace, in_place
+from calib.runs.asked.in_place import InPlace, in_place, to_be_told
 from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import identity, stand_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -118,8 +118,8 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
     )
     result = replace(result, unseen=_reaches(found.looks[0], run) if run.converged else {})
     described = bool(found.found or formulas.formulas)
-    apart = to_be_told_apart(result.candidates, result.weak_directions)
     others = [*in_place(run, stand, progress)] if result.verdict == "adequate" else []
+    apart = to_be_told(others) or to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
         plan=command_to_plan(run, apart) if apart and can_be_planned_for(stand) else "",

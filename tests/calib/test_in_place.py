@@ -42,6 +42,8 @@ def test_what_would_fit_in_place_of_an_effect_of_the_model_is_told(flexing, tmp_
     assert again.sentences[0].startswith("The model is adequate")
     said = [s for s in again.sentences if " in place of base_flex would fit as well (odds " in s]
     assert again.sentences[1 : 1 + len(said)] == said and len(said) == len(again.in_place)
+    assert again.plan.split(" --for ")[1].startswith("base_flex,") and not other["alike"]
+    assert "arm_gravity_sag" in again.plan and str(grown.folder) in again.plan
     assert read_json(grown.folder / "diagnosis.json")["in_place"] == list(again.in_place)
 
     # A fit of its own, from the start, with the sag.

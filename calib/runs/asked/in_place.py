@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,7 @@ class InPlace:
         parameter, change, unit: the estimate that differs most, in its sigmas, and by how much.
         sigmas: by how many of them.
         separate: what would separate the two.
+        alike: whether both move all that is seen alike at every pose, so that no stops do.
     """
 
     effect: str
@@ -42,6 +43,7 @@ class InPlace:
     unit: str
     sigmas: float
     separate: str
+    alike: bool
 
     @property
     def sentence(self) -> str:
@@ -100,7 +102,16 @@ def in_place(run: Run, stand: Stand, progress: Progress) -> Iterator[InPlace]:
                     rival=rival["add"],
                     odds=float(np.exp(priced)),
                     separate=rival["separate"],
+                    alike=rival["alike"],
                 )
+
+
+def to_be_told(some: Sequence[InPlace]) -> list[str]:
+    """The first effect that stops would tell from what fits in its place, and those rivals."""
+    apart = [each for each in some if not each.alike]
+    return (
+        [apart[0].effect, *(e.rival for e in apart if e.effect == apart[0].effect)] if apart else []
+    )
 
 
 def _instead(stand: Stand, effect: Effect, rival: str, progress: Progress) -> Stand | None:
@@ -139,4 +150,5 @@ def _furthest(run: Run, stand: Stand, other: Stand, effect: Effect) -> InPlace:
         unit=unit,
         sigmas=float(sigmas),
         separate="",
+        alike=False,
     )
