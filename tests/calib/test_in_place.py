@@ -1,5 +1,7 @@
 """What an effect could not be told from when it was named is not forgotten once it was added."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,17 @@ def test_what_would_fit_in_place_of_an_effect_of_the_model_is_told(flexing, tmp_
     assert other["change"] == pytest.approx(with_sag - with_flex, abs=0.1 * sigma)
     assert other["sigmas"] == pytest.approx(abs(other["change"]) / sigma, rel=1e-6)
     assert other["sigmas"] > 1.0
+
+
+def test_rivals_as_an_earlier_version_told_them_are_left_out():
+    told = {"add": "b", "dof": 1, "odds": 2.0, "separate": "stops", "alike": False}
+    candidates = [
+        {"add": "a", "dof": 2, "rivals": [told, {"add": "c", "odds": 1.0}]},
+        {"add": "d", "dof": 1, "rivals": [{"add": "c"}]},
+        {"add": "e"},
+    ]
+    run = SimpleNamespace(summary={}, diagnosis=lambda: {"candidates": candidates})
+    assert rivals_told(run) == {"a": {"dof": 2, "rivals": [told]}}
 
 
 def test_only_what_was_told_of_an_effect_is_asked_for(flexing, tmp_path):

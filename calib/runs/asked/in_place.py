@@ -19,6 +19,13 @@ from calib.solve.fit import Progress
 from chains.errors import InputError
 
 MOST_IN_PLACE = 3  # rivals of an effect, as each takes a fit: a choice
+_OF_RIVAL = {
+    "add",
+    "dof",
+    "odds",
+    "separate",
+    "alike",
+}  # some of which earlier versions did not tell
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,10 @@ def rivals_told(run: Run | None) -> dict[str, dict[str, Any]]:
         candidates = (run.diagnosis() or {}).get("candidates", ())
     except InputError:  # of another version
         candidates = ()
-    told = {c["add"]: {k: c[k] for k in ("dof", "rivals")} for c in candidates if c.get("rivals")}
+    told = {}
+    for each in candidates:
+        if rivals := [r for r in each.get("rivals", ()) if r.keys() >= _OF_RIVAL]:
+            told[each["add"]] = {"dof": each["dof"], "rivals": rivals}
     return {**run.summary.get("rivals", {}), **told}
 
 
