@@ -25,7 +25,7 @@ _OF_RIVAL = {
     "odds",
     "separate",
     "alike",
-}  # some of which earlier versions did not tell
+}  # not all by earlier versions
 
 
 @dataclass(frozen=True)
