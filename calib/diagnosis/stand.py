@@ -22,7 +22,7 @@ from calib.diagnosis.chance.beams import BeamScatter
 from calib.diagnosis.chance.serial import p_of_pose, p_serial
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import Linear, beams_looked_at, linearise_with, rows_along
-from calib.diagnosis.score import Scores, ScoreTest, away_from_model, project, score_test
+from calib.diagnosis.score import ScoreTest, away_from_model, project
 from calib.diagnosis.screen import Candidate, Screen, screen
 from calib.diagnosis.structure import of_look, singly, structure
 from calib.effects import CATALOGUE, Effect, Scatter, Site
@@ -37,7 +37,7 @@ from calib.residuals.tracker import TrackedBody
 from calib.results.intervals import Intervals, intervals
 from calib.results.sigmas import TOLERATED
 from calib.solve.estimate import Estimate, Start
-from calib.solve.fit import Progress, shapes_freed, solve
+from calib.solve.fit import Progress, fitted_as, shapes_freed, solve
 from chains.errors import InputError
 
 REFINING_BEAMS = 4_096  # of a scan, to find between which shapes the best is: a choice
@@ -87,15 +87,16 @@ class Stand:
         columns of the stops and on nothing else. Geometry of the arm, which depends on joints, and
         errors of a tracker are not counted: each stop has the rows of its tracked bodies to tell of
         them."""
-        terms = {t.variable: t for some in self.problem.terms for t in some}
+        return sum(map(self.spent_by, self.model.effects))
+
+    def spent_by(self, effect: Effect) -> int:
+        """How many of them one effect of the model has."""
         columns = {c for s in self.sources for c in s.columns}
-        return sum(
-            len(term.free)
-            for term in terms.values()
-            if term.effect.covariates and not term.effect.by_chance
-            if term.effect.site is not Site.TRACKER
-            if columns.issuperset(term.effect.covariates)
-        )
+        by_stop = effect.covariates and columns.issuperset(effect.covariates)
+        if not by_stop or effect.by_chance or effect.site is Site.TRACKER:
+            return 0
+        terms = (t for some in self.problem.terms for t in some if t.effect.name == effect.name)
+        return sum({term.variable: len(term.free) for term in terms}.values())
 
     def with_effects(self, added: Sequence[Effect], progress: Progress) -> Stand:
         """The model with more effects, fitted from here."""
@@ -131,6 +132,13 @@ class Stand:
         """Another model on these recordings, fitted from a start."""
         problem = self.problem_of(model)
         estimate = solve(problem, progress=progress, start=start)
+        return Stand(self.sources, model, problem, estimate, own=self.own)
+
+    def compared(self, model: Model, start: Start, progress: Progress) -> Stand:
+        """Another model, fitted with rows weighed and scattering as in this fit: what its cost is
+        compared by."""
+        problem = self.problem_of(model)
+        estimate = fitted_as(problem, self.estimate.problem, start, progress)
         return Stand(self.sources, model, problem, estimate, own=self.own)
 
     def problem_of(self, model: Model) -> Problem:
@@ -350,30 +358,6 @@ class Look:
         for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
             shares.add(rows.A, rows.stop, rows.place)
         return found.judged(shares, self.named.scores)
-
-    def judged_as_fitted(self, effect: Effect, progress: Progress) -> ScoreTest:
-        """The test of an effect of this look's model at what it was fitted to, clusters left out
-        one by one: Wald's. Of an effect so large that beams are rejected for it, more at one stop
-        than at another, a test without it sees these stops differ."""
-        scores, theta = as_fitted(self, effect)
-        found = score_test(scores, np.arange(len(theta)))
-        own = found.whiten.T @ scores.information @ theta
-        away = away_from_model(self.linear, list(scores.at)) @ found.whiten
-
-        def tell(done: int, total: int) -> None:
-            progress("fitting the candidates", done, total)
-
-        shares, estimate = Shares(), self.stand.estimate
-        for rows in rows_along(self.linear, self.stand.problem, estimate, away, tell):
-            shares.add(rows.A, rows.stop, rows.place)
-        return found.at(own, shares, scores)
-
-
-def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
-    """Scores of the parameters of an effect of a look's model, and these parameters (Q,)."""
-    names = variables_of(look.stand.problem, {effect.name})[effect.name]
-    values = look.stand.estimate.values
-    return project(look.linear, names), np.concatenate([values[name] for name in names])
 
 
 def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:

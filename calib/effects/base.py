@@ -148,7 +148,7 @@ class Effect(ABC):
         needs_standing: True of one about rigs that stand still over several stops.
         needs_masses: True of one that the weight of an arm's links makes.
         of_members: True where its parameters are one quantity of several rings or labels, whose
-            mean is a quantity as well.
+            mean is a quantity as well: before any data it is as uncertain as each is about it.
         of_volume: True where it is the tracker's error at a place, which markers of targets have as
             well.
         of_lidar: True when the effect belongs to the mounted LiDAR, so that rigs do not share it.

@@ -166,10 +166,10 @@ def priors(
     for (poses, dim), some in groups.items():
         known = [layout.unknowns[name] for name in some]
         mean, here = np.stack([u.mean for u in known]), np.stack([values[name] for name in some])
-        sigma = np.stack([u.prior_sigma for u in known])
+        root = np.stack([u.prior_root for u in known])
         A = np.broadcast_to(np.eye(dim), (len(some), dim, dim))
         away = here - mean
         if poses:
             away = se3.log(se3.inverse(mean) @ here)
             A = se3.right_jacobian_inverse(away)
-        yield some, A / sigma[:, :, None], -away / sigma
+        yield some, root @ A, -np.einsum("kij,kj->ki", root, away)

@@ -82,7 +82,8 @@ class Unknown:
         units: (dim,) "m" or "rad" or another unit, per tangent direction.
         role: what it stands for.
         owner: whose it is.
-        of_members: whether its numbers are one quantity of several members, whose mean is one too.
+        of_members: whether its numbers are one quantity of several members, whose mean is one too:
+            before any data it is known to their sigma, and they about it to that.
         weight: robust weight of what was known before, 0 to 1.
         scatter: of joint readings, joint -> how widely it scatters beyond what its sigma was at
             first.
@@ -121,8 +122,19 @@ class Unknown:
 
     @property
     def prior_sigma(self) -> np.ndarray:
-        """(dim,) of the rows that hold it to its mean: larger where these have less weight."""
-        return self.sigma / np.sqrt(self.weight)
+        """(dim,) of each of its numbers by the rows that hold it to its mean: larger where these
+        have less weight."""
+        common = self.sigma if self.of_members and self.dim > 1 else 0.0
+        return np.hypot(self.sigma, common) / np.sqrt(self.weight)
+
+    @property
+    def prior_root(self) -> np.ndarray:
+        """(dim, dim) those rows, whitened, by its tangent."""
+        root = np.eye(self.dim)
+        if self.of_members and self.dim > 1:
+            # The symmetric root of inverse(I + 1 1^T), whose eigenvalue along 1 is 1 / (1 + dim).
+            root -= (1.0 - 1.0 / np.sqrt(1.0 + self.dim)) / self.dim
+        return root * (np.sqrt(self.weight) / self.sigma)
 
     def reads(self, joint: str, unit: str) -> np.ndarray:
         """Of joint readings, (dim,) bool, which are of a joint in this unit, and neither exact nor

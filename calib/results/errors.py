@@ -229,10 +229,10 @@ class Foretold:
         acting = [t.variable for t in scan.terms if t.variable in known]
         drawn = [name for name in acting if known[name].role is Role.SCATTER]
         beside, end = {}, TWIST
-        if isinstance(scan.meeting, PlaneSurface):
-            for name in dict.fromkeys([scan.meeting.variable, *acting]):
-                if name in known and name not in (*drawn, *names):
-                    beside[name] = slice(end, end := end + known[name].dim)
+        planes = [scan.meeting.variable] if isinstance(scan.meeting, PlaneSurface) else []
+        for name in dict.fromkeys([*planes, *acting]):
+            if name in known and name not in (*drawn, *names):
+                beside[name] = slice(end, end := end + known[name].dim)
         d = np.hstack([placed.d[name][0] for name in names])
         d = block_diag(d, np.eye(end - TWIST))
         return cls(

@@ -21,6 +21,7 @@ from calib.diagnosis.verdict import Diagnosis, conclude
 from calib.diagnosis.verdict.known import by_name
 from calib.diagnosis.verdict.matters import HELD_OUT_BY_CHANCE, borne_out, unchecked, weighed
 from calib.diagnosis.verdict.names import believed
+from calib.diagnosis.verdict.sentences import UNNAMED
 from calib.diagnosis.verdict.unnamed import Unnamed, unnamed, with_formulas
 from calib.diagnosis.weak import to_be_told_apart, weak_directions
 from calib.effects.reference import FaroScale
@@ -43,7 +44,7 @@ from calib.runs.asked.commands import (
     next_command,
     remedies,
 )
-from calib.runs.asked.in_place import InPlace, in_place, to_be_told
+from calib.runs.asked.in_place import InPlace, Untried, in_place, to_be_told
 from calib.runs.belief import cautions, forbids, over_floor
 from calib.runs.reopen import identity, stand_of
 from calib.runs.run import DIAGNOSIS, Run
@@ -118,22 +119,31 @@ def _found(run: Run, stand: Stand, refits: bool, progress: Progress) -> Diagnosi
     )
     result = replace(result, unseen=_reaches(found.looks[0], run) if run.converged else {})
     described = bool(found.found or formulas.formulas)
-    others = [*in_place(run, stand, progress)] if result.verdict == "adequate" else []
-    apart = to_be_told(others) or to_be_told_apart(result.candidates, result.weak_directions)
+    others = []
+    if result.verdict == "adequate":
+        others = [*in_place(run, stand, found.looks[0].named.common, progress)]
+    fitting = [each for each in others if isinstance(each, InPlace)]
+    if any(each.is_better for each in fitting):
+        result = replace(result, verdict=UNNAMED, sentences=result.sentences[1:])
+    apart = to_be_told(fitting) or to_be_told_apart(result.candidates, result.weak_directions)
     return replace(
         result,
         plan=command_to_plan(run, apart) if apart and can_be_planned_for(stand) else "",
         remedies=list(remedies(run, result, can_be_planned_for(stand))),
         scatter=[*_scatter(run, stand), *result.scatter],
         detectable={**detectable(stand.sources), **_scale_detectable(result)},
-        in_place=[each.document() for each in others],
+        in_place=[each.document() for each in fitting],
         sentences=[*run.doubts, *suspect, *_said(run, found, result, others, described)],
-        command=next_command(run, result),
+        command=next_command(run, result, fitting),
     )
 
 
 def _said(
-    run: Run, found: Search, result: Diagnosis, others: Sequence[InPlace], described: bool
+    run: Run,
+    found: Search,
+    result: Diagnosis,
+    others: Sequence[InPlace | Untried],
+    described: bool,
 ) -> Iterator[str]:
     """The sentences of a diagnosis, and what else is to be said of its run.
 
@@ -141,11 +151,12 @@ def _said(
         run: the run.
         found: the search.
         result: what was concluded.
-        others: what would fit in place of effects that the model has.
+        others: what would fit, or may, in place of effects that the model has.
         described: whether names or formulas were found.
     """
     last, said = found.beside or found.looks[-1], result.sentences
-    yield from (*said[:1], *(each.sentence for each in others), *said[1:])
+    first = int(result.verdict == "adequate")
+    yield from (*said[:first], *(each.sentence for each in others), *said[first:])
     if run.converged:
         yield from told.uneven(last.blunders)
     yield from unchecked(found.looks[0], run.solution)

@@ -14,18 +14,18 @@ from calib.problem.problem import Block, Problem
 from calib.solve.added import declared
 from calib.solve.around import look_around
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
-from calib.solve.estimate import Estimate, Start, rest_of, values_of
+from calib.solve.estimate import SD, Estimate, Start, rest_of, values_of
 from calib.solve.loop import CONVERGED, HOPELESS, Loop, Progress
 from calib.solve.otherwise.orientations import lidars_turned
 from calib.solve.otherwise.unseen import joints_by_scans
-from calib.solve.reweight import reweighted
+from calib.solve.reweight import reweighted, weighted_as
 from calib.solve.torn import agreeing
 from calib.solve.turned import least_turned, turned_far
 from chains.errors import InputError
 
 ROUNDED = 1e-6  # of a cost: how far apart a fit's end and a look at it may be
 
-__all__ = ["CONVERGED", "Progress", "preview", "resume", "solve"]
+__all__ = ["CONVERGED", "Progress", "fitted_as", "preview", "resume", "solve"]
 
 
 def solve(
@@ -249,6 +249,32 @@ def stepped(
     loop.linearise_here()
     tangent, _ = loop.step()
     loop.values = loop.moved(loop.values, tangent)
+    return loop.estimate()
+
+
+def fitted_as(
+    problem: Problem,
+    like: Problem,
+    start: Start,
+    progress: Progress = lambda what, done, total: None,
+) -> Estimate:
+    """The fit of a model with rows weighed, scattering and set aside as in a fit of another model:
+    the costs of the two are of the same rows, which have the same sigmas in both.
+
+    Args:
+        problem: of the same recordings.
+        like: of that fit.
+        start: an earlier fit to start from.
+        progress: as of `solve`.
+    """
+    state = {name: x for name, x in start.state.items() if not name.endswith(SD)}
+    loop = Loop(weighted_as(problem, like), None, progress, Start(state, start.met, like.set_aside))
+    if problem.scans:
+        loop.fix_association(loop.seen_before(), start.met)
+        loop.descend_roughly()
+        loop.settle_on(CONVERGED)
+    else:
+        loop.descend(STEADY, beams=False)
     return loop.estimate()
 
 

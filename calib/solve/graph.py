@@ -242,7 +242,7 @@ class Graph:
         if not np.all(np.asarray(v.sigma) > 0):
             # GTSAM would take it for a constraint, and call all of this variable's marginals zero.
             raise ValueError(f"variable '{v.name}' has a sigma of 0; leave out what is held")
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(v.prior_sigma, float))
+        noise = gtsam.noiseModel.Gaussian.SqrtInformation(v.prior_root)
         make = {
             "vector": gtsam.PriorFactorVector,
             "pose": gtsam.PriorFactorPose3,

@@ -312,6 +312,15 @@ def retract(kind: str, value: np.ndarray, step: np.ndarray) -> np.ndarray:
     return value + step
 
 
+def whitening(v: object) -> np.ndarray:
+    """(n, n) that whitens what was known of an unknown before any data; of one quantity of several
+    members, their mean is as uncertain as each of them is about it."""
+    known = np.diag(np.square(v.sigma))
+    if v.of_members and v.dim > 1:
+        known += np.outer(v.sigma, v.sigma)
+    return np.sqrt(v.weight) * np.linalg.cholesky(np.linalg.inv(known)).T
+
+
 def shaken(variables: Mapping[str, object], values: Mapping, size: float, seed: int = 1) -> dict:
     """Every value moved by a random tangent of so many rad and m per component."""
     rng = np.random.default_rng(seed)

@@ -24,6 +24,7 @@ from chains.errors import InputError
 from ..mishaps import MISHAPS, Scene
 from ..worlds import World, write
 from . import simulated
+from .rigs import whitening
 
 ARMS = ("arm_axes_miss_each_other", "arm_base_creeps", "arm_payload")
 ARM = ("arm_link_length", "arm_joint_offset", "arm_axis_tilt", "arm_gravity_sag")
@@ -41,7 +42,7 @@ def whitened(problem, values):
     """Every row of trackers, targets and priors, plainly one after the other."""
     rows = [block.evaluate(values, False)[0] for block in problem.blocks]
     for v in problem.variables.values():
-        rows.append(v.difference(v.mean, values[v.name]) / v.prior_sigma)
+        rows.append(whitening(v) @ v.difference(v.mean, values[v.name]))
     return np.concatenate(rows)
 
 

@@ -251,25 +251,33 @@ def test_a_likelier_rival_takes_the_name_and_need_not_be_confirmed_again(
     [
         ({"arm_joint_scale": 95.0, "arm_joint_coupling": 93.0}, True, "arm_joint_coupling"),
         ({"arm_joint_scale": 98.0, "arm_joint_coupling": 97.5}, True, None),  # not by 20 to 1
+        ({"arm_joint_scale": 96.8, "arm_joint_coupling": 99.0}, True, None),  # but one of two does
         ({"arm_joint_scale": 95.0, "arm_joint_coupling": 93.0}, False, None),
         ({"arm_joint_scale": 95.0}, True, "arm_joint_scale"),  # the other is not confirmed
     ],
 )
-def test_of_rivals_that_explain_more_the_fits_decide(monkeypatch, costs, converged, named):
-    def step_of(name, cost, rivals=()):
-        estimate = SimpleNamespace(robust_cost=cost - 2, converged=converged)
+@pytest.mark.parametrize("common", [1.0, 4.0])
+def test_of_rivals_that_explain_more_the_fits_decide(monkeypatch, common, costs, converged, named):
+    """By their costs with rows weighed as beside the one named, in units of how they scatter."""
+
+    def estimate(cost):
+        return SimpleNamespace(robust_cost=(cost - 2.0) * common, converged=converged, start=None)
+
+    def step_of(name, rivals=()):
+        stand = SimpleNamespace(model=name, estimate=estimate(100.0 if rivals else 0.0))
+        stand.compared = lambda model, *_: SimpleNamespace(estimate=estimate(costs[model]))
         return NamedEffect(
             candidate=SimpleNamespace(test=SimpleNamespace(dof=2), effect=find(name)),
             before=SimpleNamespace(stand=SimpleNamespace(model=Model())),
-            after=SimpleNamespace(stand=SimpleNamespace(estimate=estimate)),
-            judged=None,
+            after=SimpleNamespace(stand=stand, named=SimpleNamespace(common=common)),
+            judged=SimpleNamespace(inflation=0.5),
             p_adjusted=0.01,
             rivals=rivals,
         )
 
     def fitted(look, candidate, found, progress, sure):
         name = candidate.effect.name
-        return [step_of(name, costs[name])] if name in costs else []
+        return [step_of(name)] if name in costs else []
 
     names = {"arm_joint_scale": -4.3, "arm_joint_coupling": -4.2, "arm_link_bending": -1.0}
     rivals = [
@@ -277,7 +285,7 @@ def test_of_rivals_that_explain_more_the_fits_decide(monkeypatch, costs, converg
         for name, odds in names.items()
     ]
     monkeypatch.setattr(steps, "_fitted", fitted)
-    found = steps._by_likelier(None, step_of("arm_gravity_sag", 100.0, rivals), [], None)
+    found = steps._by_likelier(None, step_of("arm_gravity_sag", rivals), [], None)
     assert [step.effect.name for step in found] == ([named] if named else [])
 
 

@@ -192,7 +192,7 @@ class Dense:
                 apart = RigidTransform.from_matrix(v.mean).inv() * values[v.name]
                 yield apart.as_exp_coords() / v.sigma
             else:
-                yield (values[v.name] - v.mean) / v.sigma
+                yield (values[v.name] - v.mean) @ rigs.whitening(v).T
 
 
 def _unit(vectors):

@@ -9,10 +9,12 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, log_tail
+from calib.diagnosis.judges import Shares
+from calib.diagnosis.linear import rows_along
 from calib.diagnosis.rejects import FEWEST_STOPS
-from calib.diagnosis.score import ScoreTest, score_test
+from calib.diagnosis.score import Scores, ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen
-from calib.diagnosis.stand import Look, as_fitted
+from calib.diagnosis.stand import Look, variables_of
 from calib.effects import Effect
 from calib.solve.fit import Progress
 
@@ -67,12 +69,35 @@ def judged(look: Look, candidate: Candidate, progress: Progress) -> tuple[ScoreT
     return found, float(after_looks(found.p_value(), candidate.looks))
 
 
+def as_fitted(look: Look, effect: Effect) -> tuple[Scores, np.ndarray]:
+    """Scores of the parameters of an effect of a look's model, and these parameters (Q,)."""
+    stand = look.stand
+    names = variables_of(stand.problem, {effect.name})[effect.name]
+    theta = np.concatenate([stand.estimate.values[name] for name in names])
+    return project(look.linear, names, stand.spent - stand.spent_by(effect)), theta
+
+
 def judged_as_fitted(
     look: Look, effect: Effect, looks: float, progress: Progress
 ) -> tuple[ScoreTest, float]:
-    """The test of an effect of a look's model, and its p-value after so many looks; see `Look`."""
-    found = look.judged_as_fitted(effect, progress)
-    return found, float(after_looks(found.p_value(), looks))
+    """The test of an effect of a look's model at what it was fitted to, clusters left out one by
+    one (Wald's), and its p-value after so many looks. Of an effect so large that beams are rejected
+    for it, more at one stop than at another, a test without it sees these stops differ."""
+    scores, theta = as_fitted(look, effect)
+    found = score_test(scores, np.arange(len(theta)))
+    if not found.dof:
+        return found, 1.0
+    own = found.whiten.T @ scores.information @ theta
+    away = away_from_model(look.linear, list(scores.at)) @ found.whiten
+
+    def tell(done: int, total: int) -> None:
+        progress("fitting the candidates", done, total)
+
+    shares, stand = Shares(), look.stand
+    for rows in rows_along(look.linear, stand.problem, stand.estimate, away, tell):
+        shares.add(rows.A, rows.stop, rows.place)
+    test = found.at(own, shares, scores)
+    return test, float(after_looks(test.p_value(), looks))
 
 
 def anything(look: Look, progress: Progress) -> bool:

@@ -11,8 +11,9 @@ from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.score import ScoreTest
 from calib.diagnosis.screen import ODDS, Candidate, rivals
 from calib.diagnosis.search.parts import likeliest_part
-from calib.diagnosis.stand import Look
+from calib.diagnosis.stand import Look, Stand
 from calib.effects import Effect
+from calib.solve.fit import Progress
 
 # Log odds from which a rival takes the name: evidence of 150 to 1 is called very strong (Kass and
 # Raftery 1995, JASA 90).
@@ -36,6 +37,19 @@ class Rival:
     @property
     def effect(self) -> Effect:
         return self.candidate.effect
+
+
+def log_odds(one: Stand, other: Stand, more: int, common: float) -> float:
+    """Log of how much likelier rows that they are not fitted to are expected to be with one fit
+    than with another, as of `Explained.log_score`.
+
+    Args:
+        one: a fit.
+        other: that of another model, `compared` with it.
+        more: how many more parameters that has.
+        common: the rows' inflation.
+    """
+    return (other.estimate.robust_cost - one.estimate.robust_cost) / max(common, 1e-300) + more
 
 
 def rivals_of(
@@ -108,12 +122,13 @@ class NamedEffect:
         better = [rival for rival in every if rival.log_odds < -ODDS]
         return [rival.candidate for rival in sorted(better, key=lambda rival: rival.log_odds)]
 
-    @property
-    def cost(self) -> float:
-        """Of the fit with it, half the robust chi-square and one for each of its parameters, by
-        which rows that it was not fitted to are expected to be less likely: as of
-        `Explained.log_score`."""
-        return self.after.stand.estimate.robust_cost + self.candidate.test.dof
+    def log_odds(self, other: NamedEffect, progress: Progress) -> float:
+        """Log of how much likelier other rows are expected to be with this effect than with another
+        in its place."""
+        here, there = self.after.stand, other.after.stand
+        there = here.compared(there.model, there.estimate.start, progress)
+        more = other.candidate.test.dof - self.candidate.test.dof
+        return log_odds(here, there, more, max(self.after.named.common, self.judged.inflation))
 
     def with_effect(self, effect: Effect | None) -> NamedEffect:
         """With another shape of its effect, if there is one."""

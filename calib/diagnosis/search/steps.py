@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from calib.blunders.judged import Blunder, LeftOut
 from calib.diagnosis.candidates import one_more_wave
 from calib.diagnosis.screen import ODDS, Candidate
@@ -127,13 +129,16 @@ def _by_fits(
 
     Four effects of an arm's joints may do nearly the same at a few poses, and a test that leaves
     out stops confirms that of fewest parameters. Links are then off by what tells it from the
-    others.
+    others. That something of the kind is missing is as sure as the effect named first has it.
     """
-    some = step.doubted_by[:RIVALS_FITTED]
-    every = (_fitted(look, each, found, progress, sure=step.p_adjusted) for each in some)
-    ended = (more for more in every if more and more[-1].after.stand.estimate.converged)
-    best = min(ended, key=lambda more: more[-1].cost, default=[])
-    return best if best and best[-1].cost < step.cost - ODDS else []
+    some, best = step.doubted_by[:RIVALS_FITTED], []
+    least = -ODDS - np.log(max(len(some), 1))  # that of several one fits so much better
+    for each in some:
+        more = _fitted(look, each, found, progress, sure=step.p_adjusted)
+        if more and more[-1].after.stand.estimate.converged:
+            odds = step.log_odds(more[-1], progress)
+            best, least = (more, odds) if odds < least else (best, least)
+    return best
 
 
 def _one_for_all(
@@ -185,7 +190,7 @@ def _fitted(
     after = stand.look(progress)
     if again:
         there = swapped.get(finest.effect.name, finest.effect)
-        test, p = judged_as_fitted(after, there, finest.looks, progress)
+        test, p = judged_as_fitted(after, there, 2.0 * finest.looks, progress)  # a second test
         if p >= ALPHA_EFFECT:
             return []
     if instead and any(b.found for b in after.blunders):

@@ -12,13 +12,18 @@ from calib.diagnosis.verdict import ABSORBED_BY_MODEL, Diagnosis
 from calib.diagnosis.verdict.sentences import BAD
 from calib.diagnosis.weak import group, to_be_planned
 from calib.problem.model import default_effects
+from calib.runs.asked.in_place import InPlace
 from calib.runs.run import Run
 
 
-def next_command(run: Run, found: Diagnosis) -> str:
-    """What to do next: leave out what is wrong, or add what is missing."""
+def next_command(run: Run, found: Diagnosis, others: Sequence[InPlace]) -> str:
+    """What to do next: leave out what is wrong, add what is missing, or fit that of the `others`,
+    in place of an effect of the model, which fits best and far better."""
     if tokens := told.tokens(found.blunders):
         return command_without(run, tokens)
+    best = min(others, key=lambda each: each.odds, default=None)
+    if best and best.is_better:
+        return _command_instead(run, best)
     names = [*found.worth_adding, *found.formulas]
     if found.verdict == BAD or not names:
         return ""
@@ -76,14 +81,35 @@ def can_be_planned_for(stand: Stand) -> bool:
 
 
 def command_without(run: Run, tokens: Sequence[str]) -> str:
-    """The command that fits a run's model to the same without some groups of rows."""
+    """The command that fits a run's model to the same without some groups of rows; from the run
+    where its model has effects of files, or with a shape, or was named with rivals."""
+    if _has_documents(run) or run.summary.get("rivals"):
+        new = [part for token in tokens for part in ("--without", token)]
+        out = ["-o", f"{run.folder}-without"]
+        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *run.trusting])
+    return _command_to_fit(run, run.model["effects"], tokens, "without")
+
+
+def _command_instead(run: Run, other: InPlace) -> str:
+    """The command that fits a run's model with another effect in place of one of its own; empty
+    where it cannot be typed."""
+    if _has_documents(run):
+        return ""
+    effects = [other.rival if name == other.effect else name for name in run.model["effects"]]
+    return _command_to_fit(run, effects, (), "instead")
+
+
+def _has_documents(run: Run) -> bool:
+    """Whether effects of a run's model are of files, or have a shape."""
+    return any(not isinstance(effect, str) for effect in run.model["effects"])
+
+
+def _command_to_fit(run: Run, effects: Sequence[str], tokens: Sequence[str], to: str) -> str:
+    """The command that fits a run's recordings as they were, with these effects, and without some
+    more groups of rows."""
     left_out = [*run.model.get("without", ()), *tokens]
     without = [part for token in left_out for part in ("--without", token)]
-    effects = run.model["effects"]
-    out = ["-o", f"{run.folder}-without"]
-    if any(not isinstance(effect, str) for effect in effects):  # of files, or with a shape
-        new = without[-2 * len(tokens) :]
-        return shlex.join(["rigcal", "add", str(run.folder), *out, *new, *run.trusting])
+    out = ["-o", f"{run.folder}-{to}"]
     usual = None if run.prior else default_effects(run.recordings)
     chosen = [] if tuple(effects) == usual else ["--effects", ",".join(effects)]
     chosen += [part for name in run.model["fixed"] for part in ("--fix", name)]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib.diagnosis.screen import ODDS
+from calib.diagnosis.search.named import log_odds
 from calib.diagnosis.stand import Stand, tried
 from calib.diagnosis.verdict.sentences import odds_told
 from calib.effects import Effect, find
@@ -19,13 +20,7 @@ from calib.solve.fit import Progress
 from chains.errors import InputError
 
 MOST_IN_PLACE = 3  # rivals of an effect, as each takes a fit: a choice
-_OF_RIVAL = {
-    "add",
-    "dof",
-    "odds",
-    "separate",
-    "alike",
-}  # not all by earlier versions
+_OF_RIVAL = {"add", "dof", "odds", "separate", "alike"}  # not all by earlier versions
 
 
 @dataclass(frozen=True)
@@ -36,8 +31,7 @@ class InPlace:
         effect, rival: their names.
         odds: how much likelier other rows are expected to be with the effect than with the rival,
             by fits with each.
-        parameter, change, unit: the estimate that differs most, in its sigmas, and by how much.
-        sigmas: by how many of them.
+        change: what that does to the estimate that it moves furthest.
         separate: what would separate the two.
         alike: whether both move all that is seen alike at every pose, so that no stops do.
     """
@@ -45,72 +39,126 @@ class InPlace:
     effect: str
     rival: str
     odds: float
-    parameter: str
-    change: float
-    unit: str
-    sigmas: float
+    change: Change
     separate: str
     alike: bool
 
     @property
+    def is_better(self) -> bool:
+        """Whether the model has the wrong one of the two."""
+        return self.odds < np.exp(-ODDS)
+
+    @property
     def sentence(self) -> str:
         """For people."""
-        times, unit = shown(self.unit)
-        fits = "better" if self.odds < np.exp(-ODDS) else "as well"
+        times, unit = shown(self.change.unit)
+        fits = "far better" if self.is_better else "as well"
         return (
             f"{self.rival} in place of {self.effect} would fit {fits} "
-            f"({odds_told(self.odds)}), and {self.parameter} would be "
-            f"{times * abs(self.change):.3g} {unit} otherwise, {self.sigmas:.1f} of its sigmas; "
-            f"{self.separate} would separate them."
+            f"({odds_told(self.odds)}), and {self.change.parameter} would be "
+            f"{times * abs(self.change.change):.3g} {unit} otherwise, {self.change.sigmas:.1f} of "
+            f"its sigmas; {self.separate} would separate them."
         )
 
     def document(self) -> dict[str, Any]:
         """As diagnosis.json has it."""
-        return dict(vars(self))
+        own = {name: x for name, x in vars(self).items() if name != "change"}
+        return own | self.change._asdict()
+
+
+class Change(NamedTuple):
+    """By how much an estimate differs between two fits.
+
+    Args:
+        parameter: which.
+        change, unit: by how much, in its unit.
+        sigmas: in its sigmas.
+    """
+
+    parameter: str = "no parameter"
+    change: float = 0.0
+    unit: str = ""
+    sigmas: float = 0.0
+
+
+@dataclass(frozen=True)
+class Untried:
+    """Another effect that may fit in place of one that the model has, and was not fitted.
+
+    Args:
+        effect, rival: their names.
+        why: a clause.
+    """
+
+    effect: str
+    rival: str
+    why: str
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return (
+            f"When {self.effect} was named, {self.rival} explained as much; whether it would fit "
+            f"as well in its place is not known, as {self.why}."
+        )
 
 
 def rivals_told(run: Run | None) -> dict[str, dict[str, Any]]:
     """Effect -> how many parameters it has, as its test has them, and its `rivals`, as the run and
-    its diagnosis tell them; empty where nothing was told."""
+    its diagnosis tell them; empty where nothing was told. A rival has the effect as its own, as
+    either may be added."""
     if run is None:
         return {}
     try:
         candidates = (run.diagnosis() or {}).get("candidates", ())
     except InputError:  # of another version
         candidates = ()
-    told = {}
+    told: dict[str, dict[str, Any]] = {}
     for each in candidates:
         if rivals := [r for r in each.get("rivals", ()) if r.keys() >= _OF_RIVAL]:
             told[each["add"]] = {"dof": each["dof"], "rivals": rivals}
-    return {**run.summary.get("rivals", {}), **told}
+    turned: dict[str, dict[str, Any]] = {}
+    for name, each in told.items():
+        for rival in (r for r in each["rivals"] if r["add"] not in told):
+            of = {"add": name, "dof": each["dof"], "odds": 1.0 / max(rival["odds"], 1e-300)}
+            other = turned.setdefault(rival["add"], {"dof": rival["dof"], "rivals": []})
+            other["rivals"].append({**rival, **of})
+    return {**run.summary.get("rivals", {}), **turned, **told}
 
 
-def in_place(run: Run, stand: Stand, progress: Progress) -> Iterator[InPlace]:
+def in_place(
+    run: Run, stand: Stand, common: float, progress: Progress
+) -> Iterator[InPlace | Untried]:
     """Rivals of the effects of a run's model with which it would fit as well.
 
     Args:
         run: the run.
         stand: as it stands.
+        common: the inflation of its rows.
         progress: as of `fit.solve`.
     """
     every = run.summary.get("rivals", {})
     some = [effect for effect in stand.model.effects if effect.name in every]
-    if some:  # as the others are fitted
+    if some and not run.prior:  # as the others are fitted
         stand = stand.refitted(stand.model, stand.estimate.start, progress)
+    there = {each.family for each in stand.model.effects}
     for effect in some:
         told = every[effect.name]
         for rival in sorted(told["rivals"], key=lambda each: each["odds"])[:MOST_IN_PLACE]:
-            other = _instead(stand, effect, rival["add"], progress)
-            if other is None:
+            name = rival["add"]
+            if name.partition("@")[0] in there:
                 continue
-            priced = other.estimate.robust_cost - stand.estimate.robust_cost
-            priced += rival["dof"] - told["dof"]
+            other = _instead(run, stand, effect, name, progress)
+            if isinstance(other, str):
+                yield Untried(effect.name, name, other)
+                continue
+            priced = log_odds(stand, other, rival["dof"] - told["dof"], common)
             if priced < ODDS:
-                moved = _furthest(run, stand, other, effect)
-                yield replace(
-                    moved,
-                    rival=rival["add"],
+                yield InPlace(
+                    effect=effect.name,
+                    rival=name,
                     odds=float(np.exp(priced)),
+                    change=_furthest(run, stand, other),
                     separate=rival["separate"],
                     alike=rival["alike"],
                 )
@@ -124,41 +172,32 @@ def to_be_told(some: Sequence[InPlace]) -> list[str]:
     )
 
 
-def _instead(stand: Stand, effect: Effect, rival: str, progress: Progress) -> Stand | None:
-    """The model's fit with a rival in place of an effect; None where there is none."""
+def _instead(
+    run: Run, stand: Stand, effect: Effect, rival: str, progress: Progress
+) -> Stand | str:
+    """The model's fit with a rival in place of an effect; why there is none."""
+    if run.prior:
+        return "this run rests on an earlier one"
     own = (each for each in stand.own if each.name == rival)
     try:
         other = next(own, None) or find(rival)
-    except InputError:  # one's own that is given no more
-        return None
-    if other.family in {each.family for each in stand.model.effects}:
-        return None
+    except InputError:
+        return "its file is not among the candidates"
     model = stand.model.minus([effect.name]).plus((other,))
-    fitted = tried(stand.refitted, model, stand.estimate.start, progress)
-    return fitted if fitted and fitted.estimate.converged else None
+    fitted = tried(stand.compared, model, stand.estimate.start, progress)
+    if fitted is None or not fitted.estimate.converged:
+        return "the fit with it comes to no optimum"
+    return fitted
 
 
-def _furthest(run: Run, stand: Stand, other: Stand, effect: Effect) -> InPlace:
-    """The estimate that differs most in its sigmas, of those that both have."""
+def _furthest(run: Run, stand: Stand, other: Stand) -> Change:
+    """Of the estimates that both have the one that differs most in its sigmas."""
     sigma = dict(zip(run.solution.keys, np.sqrt(np.diag(run.solution.covariance)), strict=True))
     there: Mapping[str, np.ndarray] = other.estimate.values
     found = []
-    for unknown in stand.estimate.variables:
-        if unknown.name not in there:
-            continue
+    for unknown in (u for u in stand.estimate.variables if u.name in there):
         change = unknown.difference(stand.estimate.values[unknown.name], there[unknown.name])
         for dof, unit, by in zip(unknown.dofs, unknown.units, change.tolist(), strict=True):
-            if own := sigma.get(Key(unknown.name, dof)):
-                found.append((abs(by) / own, f"{unknown.name}.{dof}", by, unit))
-    sigmas, parameter, change, unit = max(found, default=(0.0, "no parameter", 0.0, ""))
-    return InPlace(
-        effect=effect.name,
-        rival="",
-        odds=np.nan,
-        parameter=parameter,
-        change=float(change),
-        unit=unit,
-        sigmas=float(sigmas),
-        separate="",
-        alike=False,
-    )
+            if own := sigma.get(key := Key(unknown.name, dof)):
+                found.append(Change(key.name, by, unit, float(abs(by) / own)))
+    return max(found, key=lambda each: each.sigmas, default=Change())

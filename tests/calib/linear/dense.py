@@ -90,8 +90,9 @@ class Dense:
         J = np.eye(unknown.dim)
         if unknown.kind != "vector":
             J = rigs.differences(residual, self.values, name, unknown.kind)
-        b = -residual(self.values) / unknown.prior_sigma
-        self._add(b, {name: J / unknown.prior_sigma[:, None]}, f"prior:{name}")
+        root = rigs.whitening(unknown)
+        b = -root @ residual(self.values)
+        self._add(b, {name: root @ J}, f"prior:{name}")
 
     def _beams(self, number: int) -> None:
         """The rows of a stop, and which stop, mesh and surface (or plane) each errs with."""
