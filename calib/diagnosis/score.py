@@ -261,7 +261,9 @@ class ScoreTest:
             shares: rows of the clusters along these.
             scores: those that this test was made from.
         """
-        told = np.array([(rows @ own) @ rows for rows in shares.rows]).reshape(len(shares.rows), len(own))
+        told = np.array([(rows @ own) @ rows for rows in shares.rows]).reshape(
+            len(shares.rows), len(own)
+        )
         pairs = np.stack([scores.stop, scores.place], axis=1)
         pairs = np.concatenate([pairs, np.array(shares.pairs, int).reshape(-1, 2)])
         whole = np.concatenate([scores.cells[:, self.columns] @ self.whiten, told])

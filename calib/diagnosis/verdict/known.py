@@ -17,7 +17,7 @@ from calib.diagnosis.candidates import finer
 from calib.diagnosis.score import information_left, score_test
 from calib.diagnosis.screen import Candidate
 from calib.diagnosis.search import NamedEffect, Search
-from calib.diagnosis.search.confirmed import structures
+from calib.diagnosis.search.confirmed import as_fitted, structures
 from calib.diagnosis.stand import Look, Stand, tried, variables_of
 from calib.diagnosis.verdict.matters import as_good
 from calib.diagnosis.verdict.unnamed import Unnamed

@@ -172,9 +172,7 @@ def to_be_told(some: Sequence[InPlace]) -> list[str]:
     )
 
 
-def _instead(
-    run: Run, stand: Stand, effect: Effect, rival: str, progress: Progress
-) -> Stand | str:
+def _instead(run: Run, stand: Stand, effect: Effect, rival: str, progress: Progress) -> Stand | str:
     """The model's fit with a rival in place of an effect; why there is none."""
     if run.prior:
         return "this run rests on an earlier one"
