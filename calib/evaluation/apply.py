@@ -105,14 +105,17 @@ def _apply_file(correction: Correction, cloud: Path, target: Path) -> Applied:
 
 
 def _of_another_rig(mine: Rig, folder: Path, run: Run) -> Iterator[str]:
-    """That a recording is of another rig than the run's, where its name or its joints say so."""
+    """That a recording is of another rig than the run's, where its name, its joints or the origin
+    of its LiDAR's beams say so."""
     theirs = load_rig(folder)
     if theirs.lidar is None or theirs.lidar.name != mine.lidar.name:
         has = f"has {theirs.lidar.name}" if theirs.lidar else "has no LiDAR"
         raise InputError(
             f"{folder} {has}, and {run.folder} is of {mine.lidar.name}; give a run of its LiDAR"
         )
-    if theirs.name != mine.name:
+    if not np.array_equal(theirs.lidar.beam_origin_m, mine.lidar.beam_origin_m):
+        differ = f"has beams with another origin (beam_origin_m) than that of {run.folder}"
+    elif theirs.name != mine.name:
         differ = f"is of rig {theirs.name}, and {run.folder} of {mine.name}"
     elif theirs.joint_names != mine.joint_names:
         differ = f"is of an arm with other joints than that of {run.folder}"

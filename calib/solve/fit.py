@@ -149,17 +149,22 @@ def _go_on(loop: Loop, tolerance: float) -> None:
 
 def _take_back(loop: Loop, tolerance: float) -> None:
     """Go on with scans that an earlier fit set aside and that contradict the others no more, as
-    where an effect was missing that put them so far off."""
+    where an effect was missing that put them so far off; without them where they still do once the
+    fit has them."""
     if loop.lost or not loop.problem.aside:
         return
-    seen, met = loop.seen, loop.met
-    back = agreeing(loop.problem.aside, loop.values, float(np.median(loop.here.scale)))
+    usual = float(np.median(loop.here.scale))
+    back = agreeing(loop.problem.aside, loop.values, usual)
     if not back:
         return
+    kept, seen, met = loop.kept(), loop.seen, loop.met
     loop.give(loop.given.setting_aside(loop.given.set_aside - back))
     loop.settle(tolerance, seen, met)
     loop.reweigh(beams=True)
     loop.settle_on(tolerance)
+    taken = [scan for scan in loop.problem.scans if scan.group.token in back]
+    if loop.lost or agreeing(taken, loop.values, usual) != back:
+        loop.go_back(kept)
 
 
 def _hear_rejected(loop: Loop, tolerance: float) -> None:

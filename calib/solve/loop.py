@@ -315,7 +315,7 @@ class Loop(Descent):
 
     def kept(self) -> tuple[Any, ...]:
         """Where the fit is now, for `go_back`."""
-        return self.given, self.problem, self.values, self.associations, self.seen
+        return self.given, self.problem, dict(self.values), self.associations, self.seen
 
     def go_back(self, kept: tuple[Any, ...]) -> None:
         """Be where the fit was, before it was lost if it is."""

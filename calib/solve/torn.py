@@ -198,12 +198,13 @@ def agreeing(scans: Sequence[ScanStop], values: Mapping[str, np.ndarray], scale:
 
 
 def _scale_of(values: Mapping[str, np.ndarray], scan: ScanStop) -> float:
-    """How many sigmas wide the bulk of a scan's residuals is; infinite where it meets nothing."""
+    """How many sigmas wide the bulk of a scan's residuals is; infinite where no beam tells."""
     try:
         rows = scan.rows(values, None)
     except NothingMetError:
         return np.inf
-    return robust_scale((rows.residual_m / rows.sigma_m)[rows.usable])
+    told = (rows.residual_m / rows.sigma_m)[rows.usable]
+    return robust_scale(told) if len(told) else np.inf
 
 
 def _beyond_doubt(

@@ -247,6 +247,7 @@ def test_a_run_without_a_lidar_corrects_nothing(tmp_path):
     ("was", "now", "said"),
     [
         ("name: husky-lwa4p", "name: other", "is of rig other-hesai_pandarqt64, and "),
+        ("frame: lidar", "frame: lidar, beam_origin_m: [0.01, 0.02]", "(beam_origin_m) than that"),
         ("", "", None),
     ],
 )

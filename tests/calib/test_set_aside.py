@@ -1,5 +1,8 @@
 """Scans that a fit set aside, or was told to leave out: what follows a fit goes on without them."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,14 +14,23 @@ from calib.report import report
 from calib.runs.add import add
 from calib.runs.calibrate import calibrate
 from calib.runs.diagnose import diagnose
+from calib.runs.reopen import stand_of
 from calib.runs.run import RESIDUALS, Run
 from calib.simulation import simulate
+from calib.solve import fit
+from calib.solve.torn import agreeing
 from calib.view.scene import Scene
 from sensors.recording import read_table
 
 from .simulated import made
 
 pytestmark = pytest.mark.slow
+
+
+def quiet(what, done, total):
+    pass
+
+
 EXCHANGED = ("L00P00", "L03P02")
 TOKENS = [f"{stop}:scan" for stop in EXCHANGED]
 
@@ -113,6 +125,33 @@ def test_a_scan_that_a_missing_effect_put_far_off_is_taken_back(sagging, tmp_pat
     for name in grown.effects:
         ours, theirs = (each.solution.shared.effects[name] for each in (grown, cold))
         assert (np.abs(ours.estimate - theirs.estimate) <= 0.15 * theirs.sigma).all()
+
+
+def test_a_scan_that_contradicts_the_others_once_a_fit_has_it_stays_set_aside(
+    sagging, tmp_path, monkeypatch
+):
+    grown, asked = add(sagging, "arm_gravity_sag", tmp_path / "grown"), []
+
+    def once(*of):
+        asked.append(of)
+        return agreeing(*of) if len(asked) == 1 else set()
+
+    monkeypatch.setattr(fit, "agreeing", once)
+    (effect,) = (find(name) for name in grown.effects if name == "arm_gravity_sag")
+    stand = stand_of(sagging, quiet).with_effects([effect], quiet)
+    assert len(asked) == 2 and stand.estimate.converged
+    assert stand.estimate.problem.set_aside == {"L01P00:scan"}
+    assert len(stand.estimate.scans) == 11
+
+
+def test_a_scan_without_a_beam_that_counts_agrees_with_nothing(sagging):
+    stand = stand_of(sagging, quiet)
+    (scan,) = stand.estimate.problem.aside
+    rows = scan.rows(stand.estimate.values, None)
+    none = replace(rows, usable=np.zeros_like(rows.usable))
+    blind = SimpleNamespace(rows=lambda *_: none, group=scan.group)
+    assert agreeing([blind], stand.estimate.values, 1.0) == set()
+    assert agreeing([scan], stand.estimate.values, 1e3) == {"L01P00:scan"}
 
 
 @pytest.mark.long

@@ -177,7 +177,7 @@ def _models_differ(a: Run, b: Run) -> Iterator[str]:
         alone = [k for k in one.solution.keys if k.unknown in of_both and k not in theirs]
         if own := [key.name for key in alone if key.name not in held]:
             named = ", ".join(own[:NAMED_ALONE]) + (", …" if len(own) > NAMED_ALONE else "")
-            yield f"Only {one.folder} has {named}: the two are of different arms"
+            yield f"Only {one.folder} has {named}: joints of {other.folder} differ, or are not read"
 
 
 def _shared(a: Run, b: Run, bounds: Sequence[str], links: int) -> Iterator[str]:
