@@ -14,6 +14,7 @@ from scipy.sparse import csr_array
 from calib.blunders.rows import GraphRows, GroupRows, group_rows
 from calib.linear.clusters import Entries, over_all
 from calib.linear.layout import positions
+from calib.linear.symmetric import eigh
 from calib.linear.system import Linearisation
 from calib.problem.problem import Problem
 from calib.residuals.groups import Group
@@ -184,7 +185,7 @@ def contradicted(M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Eigenvalues (..., r) and eigenvectors (..., r, r) of redundancies (..., r, r), and along
     which of these (..., r) anything contradicts."""
     one = M.shape[-1] == 1
-    values, axes = (M[..., 0], np.ones_like(M)) if one else np.linalg.eigh(M)
+    values, axes = (M[..., 0], np.ones_like(M)) if one else eigh(M)
     return values, axes, values > HELD_ALONE
 
 

@@ -26,6 +26,7 @@ from scipy.linalg import block_diag
 
 from calib.blunders.others import Alike, Others, at_their_sigmas, contradicted, whitening
 from calib.blunders.rows import GroupRows, scan_rows
+from calib.linear.symmetric import pinv
 from calib.problem.spread import Whose
 from calib.problem.unknowns import is_read
 from calib.residuals.groups import ALONG_BEAMS, Group
@@ -144,7 +145,7 @@ def _beside_others(M: np.ndarray, u: np.ndarray, each: Sequence[np.ndarray]) -> 
     C, x = whiten @ whiten.T, whiten @ (whiten.T @ u[at])
     ends = np.cumsum([0, *map(len, each)]).tolist()
     parts = [slice(*pair) for pair in pairwise(ends)]
-    return np.array([x[i] @ np.linalg.pinv(C[i, i], hermitian=True) @ x[i] for i in parts])
+    return np.array([x[i] @ pinv(C[i, i]) @ x[i] for i in parts])
 
 
 def beside_bodies(others: Others, whose: Collection[Whose], wild: Collection[Group]) -> Sums:

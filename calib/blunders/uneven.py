@@ -15,6 +15,7 @@ from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks
 from calib.blunders.shifts import Shift
+from calib.linear.symmetric import pinv
 from calib.problem.model import labels
 from calib.problem.problem import Problem
 
@@ -150,7 +151,7 @@ def _p_of_mean(offsets: np.ndarray, own: int) -> float:
     spread = np.cov(offsets.T).reshape(own, own)
     size = np.sqrt(np.maximum(np.diag(spread), 1e-300))
     mean = offsets.mean(axis=0) / size
-    squared = count * mean @ np.linalg.pinv(spread / np.outer(size, size), hermitian=True) @ mean
+    squared = count * mean @ pinv(spread / np.outer(size, size)) @ mean
     others = count - own
     return float(special.fdtrc(own, others, squared * others / (own * (count - 1))))
 

@@ -80,6 +80,7 @@ from scipy import special
 from calib.linear.cluster_sums import ALONE
 from calib.linear.clusters import summed
 from calib.linear.layout import positions
+from calib.linear.symmetric import eigh
 
 UNKNOWN_VARIANCE = 1e12  # variance, of a whitened score, where nothing tells it
 # Least stops, or surfaces, for each parameter that one of these tells as one. Measured in the
@@ -283,7 +284,7 @@ class Clusters:
             if norm < ALONE:
                 out.append((c, np.linalg.inv(one - information), one[:, :0]))
                 continue
-            values, axes = np.linalg.eigh(information)
+            values, axes = eigh(information)
             inverse = (axes / (1.0 - np.clip(values, 0.0, ALONE))) @ axes.T
             out.append((c, inverse, axes[:, values > ALONE]))
         return out

@@ -17,6 +17,7 @@ from calib.diagnosis.jackknife import Clusters, ScoreSpread, by_leaving_out, by_
 from calib.linear.clusters import summed
 from calib.linear.elimination import square_root
 from calib.linear.layout import positions
+from calib.linear.symmetric import eigh
 
 SLIGHT_LEFT = 0.05  # of a direction's information: with less of it left, it is not tested
 # Of a part's information, from which a cluster is worth a look without it: where none holds as much
@@ -125,7 +126,7 @@ class SomeCells:
         plain = kept.all() and axes is None
         axes = np.eye(rows.shape[1]) if axes is None else axes
         whole = axes.T @ (rows.T @ rows) @ axes
-        values, vectors = np.linalg.eigh(whole)
+        values, vectors = eigh(whole)
         seen = values > SLIGHT_LEFT
         if not seen.any():
             return None
@@ -245,7 +246,7 @@ class Judges:
         said = held @ told
         off = scores[~kept].sum(axis=0) - said
         variance = held + held @ whiten @ whiten.T @ held
-        values, axes = np.linalg.eigh(variance)
+        values, axes = eigh(variance)
         seen = values > SLIGHT_LEFT
         if not seen.any() or rest.d <= 0.0:
             return True
@@ -260,7 +261,7 @@ class Judges:
 def _adding_up(rows: np.ndarray) -> np.ndarray:
     """Rows (N, r), changed so that ``rows.T @ rows`` is 1. It is so already, but for rounding,
     unless beams were drawn."""
-    values, axes = np.linalg.eigh(rows.T @ rows)
+    values, axes = eigh(rows.T @ rows)
     return rows @ (axes / np.sqrt(np.maximum(values, SLIGHT_LEFT))) @ axes.T
 
 
@@ -270,7 +271,7 @@ def _held(information: np.ndarray, axes: np.ndarray, most: float) -> np.ndarray:
     found = [np.zeros((axes.shape[1], 0))]
     norm = np.linalg.norm(information, axis=(1, 2))  # no less than it holds of any direction
     for each in information[norm > most]:
-        values, vectors = np.linalg.eigh(axes.T @ each @ axes)
+        values, vectors = eigh(axes.T @ each @ axes)
         found.append(vectors[:, values > most])
     return np.hstack(found)
 

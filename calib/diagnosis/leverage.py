@@ -24,6 +24,7 @@ from calib.linear.cluster_sums import ALONE
 from calib.linear.clusters import ClusteredRows
 from calib.linear.layout import Layout, positions
 from calib.linear.own import OwnRows, priors
+from calib.linear.symmetric import eigh
 from calib.problem.unknowns import Role
 
 Values = Mapping[str, np.ndarray]
@@ -123,6 +124,6 @@ def _grown(e: np.ndarray, kept: np.ndarray, own: np.ndarray, C: np.ndarray) -> n
         axes, size, _ = np.linalg.svd(own, full_matrices=False)
         axes = axes * (size > UNTOUCHED_SHARE * size[:, :1])[:, None]
         kept = kept - axes @ (axes.mT @ kept)
-    values, axes = np.linalg.eigh(kept @ C @ kept.mT)
+    values, axes = eigh(kept @ C @ kept.mT)
     root = 1.0 / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))
     return np.matvec(axes, root * np.matvec(axes.mT, e))

@@ -21,6 +21,7 @@ from calib.diagnosis.jackknife import ScoreSpread, ShareSquares, spread_by
 from calib.diagnosis.judges import Shares
 from calib.diagnosis.linear import NONE, Linear
 from calib.linear.clusters import summed
+from calib.linear.symmetric import eigh, pinv
 from calib.problem.unknowns import Owner
 
 GAUGE = 1e-6  # share of a direction's information that is left, below which there is none
@@ -308,7 +309,7 @@ class ScoreTest:
         if not self.dof:
             return np.inf
         # Along a direction of unit length the information is this much, on average.
-        each = np.trace(np.linalg.pinv(self.whiten @ self.whiten.T)) / len(self.score)
+        each = np.trace(pinv(self.whiten @ self.whiten.T)) / len(self.score)
         return min(self._detectable(chance, common, alpha) for chance in self.chances) / each**0.5
 
     def _detectable(self, chance: ScoreSpread, common: float, alpha: float) -> float:
@@ -331,7 +332,7 @@ def explained(scores: Scores, columns: np.ndarray) -> tuple[np.ndarray, float]:
     size = np.sqrt(np.maximum(scores.felt[columns], 0.0))
     size = np.where(size > UNFELT * size.max(initial=0.0), size, np.inf)
     block = scores.information[np.ix_(columns, columns)]
-    values, axes = np.linalg.eigh(block / np.outer(size, size))
+    values, axes = eigh(block / np.outer(size, size))
     seen = values > GAUGE
     whiten = (axes[:, seen] / np.sqrt(values[seen])) / size[:, None]
     return whiten, float(np.sum(np.square(whiten.T @ scores.score[columns])))

@@ -12,6 +12,7 @@ from calib.diagnosis.score import projection
 from calib.diagnosis.stand import Look
 from calib.diagnosis.suggest import what_separates
 from calib.effects import Effect
+from calib.linear.symmetric import eigh
 from calib.problem.unknowns import Key
 from calib.results.observability import UNTOLD, echelon
 from calib.results.solution import Solution
@@ -98,7 +99,7 @@ def hardly_known(
     still, rest = np.zeros((len(known), 0)), np.eye(len(known))
     if everywhere is not None:
         still, rest = everywhere.split(keys, known)
-    values, axes = np.linalg.eigh(rest.T @ (covariance / np.outer(known, known)) @ rest)
+    values, axes = eigh(rest.T @ (covariance / np.outer(known, known)) @ rest)
     untold, axes = values > UNTOLD, rest @ axes
     weak = [(1.0, axis, False) for axis in _of_space(axes[:, untold])]
     told = sorted(zip(values[~untold], axes.T[~untold], strict=True), key=lambda pair: -pair[0])

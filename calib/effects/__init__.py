@@ -61,6 +61,7 @@ from calib.effects.elastic import (
     ArmPayloadSag,
     ArmTorqueSag,
     BaseFlex,
+    BodyBending,
     MountBending,
 )
 from calib.effects.noise import NoiseIncidence, NoiseIntensity, NoiseRange
@@ -182,6 +183,7 @@ CATALOGUE: tuple[Effect, ...] = (
     MountCreep(),
     MountSettle(),
     MountBending(),
+    BodyBending(),
     StandSlip(),
     StandCreep(),
     StandSettle(),

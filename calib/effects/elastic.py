@@ -1,4 +1,4 @@
-"""What gives way under its load: joints, links, the base, the mount.
+"""What gives way under its load: joints, links, the base, the mount, a tracked body.
 
 The weights are those of the URDF's links, and what stops say each tip of the arm carries. Up
 is where levels say; without any, the root's z axis is taken to point up.
@@ -12,13 +12,16 @@ import numpy as np
 
 from calib.effects.base import Effect, Param, Site, View
 from calib.effects.basis import finite
-from calib.effects.rig import mount_edges
+from calib.effects.rig import DOF, mount_edges
 from calib.rig import Rig
 from calib.rig.columns import PAYLOAD, load_columns
 from chains import se3
 from chains.arm import UPRIGHT, Mass, gravity_moment, gravity_torque
 
 PER_TORQUE = {"revolute": "rad/(N m)", "prismatic": "m/N"}
+# m and rad: a beam that sags by 1 mm turns by 1.5 mm over its length.
+BENT_M, BENT_RAD = 0.001, 0.005
+OF_SYMMETRIC = tuple(zip(*np.triu_indices(3), strict=True))  # rows and columns
 SOFT = 2e-4  # rad/(N m): a soft gear, as of a small collaborative arm
 
 
@@ -259,6 +262,41 @@ class MountBending(Effect):
         return basis
 
 
+class BodyBending(Effect):
+    """What a tracked body beyond the arm hangs on gives way under its weight: a mast or a bracket
+    bends. Like the base's height, what all poses share of it is not told by the tracker alone.
+
+    A mast along the unit vector n has ``K = k (1 - n n^T)``, and turns by ``c`` along n.
+    """
+
+    name = "body_bending"
+    site = Site.TRACKER
+    unit = "m, rad"
+    formula = "the body shifts by K g and turns by c x g, gravity g a unit vector in its axes"
+    typical = "0.1 to 2 mm of a mast or a printed bracket, size assumed"
+    covariates = ("joints",)
+    confounded_with = ("arm_gravity_sag", "mount_bending", "arm_link_bending")
+    source = "a body on springs: K symmetric (Maxwell's reciprocity), c of its beam; size assumed"
+
+    def params(self, rig: Rig) -> tuple[Param, ...]:
+        each = [Param("xyz"[i] + "xyz"[j], "m", BENT_M) for i, j in OF_SYMMETRIC]
+        each += [Param(name, "rad", BENT_RAD) for name in DOF[:3]]
+        return tuple(replace(p, name=f"{b}.{p.name}") for b in _carried(rig) for p in each)
+
+    def basis(self, view: View) -> np.ndarray:
+        own, tree = _carried(view.rig), view.rig.tree
+        every = view.rig.tracker.bodies
+        basis = np.zeros((len(view.joints), len(every), 6, 9 * len(own)))
+        for at, body in enumerate(own):
+            T_root_body = tree.place(body, view.joints).Ts_root_frame
+            down = -np.matvec(T_root_body[:, :3, :3].mT, up(view))
+            mine = basis[:, every.index(body), :, 9 * at : 9 * (at + 1)]
+            for k, (i, j) in enumerate(OF_SYMMETRIC):
+                mine[:, 3 + i, k], mine[:, 3 + j, k] = down[:, j], down[:, i]
+            mine[:, :3, 6:] = -se3.skew(down)
+        return basis
+
+
 def masses(view: View) -> list[Mass]:
     """What weighs on the arm at the view's stops: its links, and the payload at each tip."""
     return [*view.rig.masses, *_payloads(view)]
@@ -276,6 +314,12 @@ def _payloads(view: View) -> list[Mass]:
         for tip, column in load_columns(view.rig).items()
         if column in view.columns
     ]
+
+
+def _carried(rig: Rig) -> tuple[str, ...]:
+    """The tracked bodies that the arm moves."""
+    bodies = rig.tracker.bodies if rig.tracker else ()
+    return tuple(body for body in bodies if rig.joints_to(body))
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

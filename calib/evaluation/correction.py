@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.diagnosis.formulas.seen import ColumnRanges
 from calib.effects import Effect, LazyColumn, Site, View
+from calib.linear.symmetric import eigh
 from calib.problem.model import Source
 from calib.residuals.beams import site_error
 from calib.residuals.store import common_median
@@ -201,7 +202,7 @@ def _on_planes(around_m: np.ndarray, direction: np.ndarray, sigma_m: float) -> n
     """Incidence (N,) of beams of a direction (N, 3) on the plane of points (N, K, 3) around."""
     count = around_m.shape[1]
     away_m = around_m - around_m.mean(axis=1, keepdims=True)
-    variance, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away_m, away_m))
+    variance, axes = eigh(np.einsum("nki,nkj->nij", away_m, away_m))
     along = np.abs(np.einsum("ni,ni->n", axes[:, :, 0], direction))
     thick_m, wide_m = np.sqrt(np.maximum(variance[:, :2], 0.0) / count).T
     plane = thick_m < THICKEST_SIGMAS * sigma_m + THICKEST * wide_m

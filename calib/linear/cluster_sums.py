@@ -12,6 +12,7 @@ from scipy import special
 from scipy.linalg import solve_triangular
 
 from calib.linear.clusters import CellSums, ClusteredRows, summed
+from calib.linear.symmetric import eigh
 
 # Degrees of freedom that t has at least. With fewer it grows without bound (12.7 with 1): such an
 # interval would speak of the clusters, not of the estimate. With 4 stops 0.94 hold with it.
@@ -168,7 +169,7 @@ class ClusterSums:
         found = {}
         for stop, products in self.stops.items() if len(self.stops) <= MOST_WHOLE_STOPS else ():
             half = solve_triangular(self.root, products, lower=True)
-            values, axes = np.linalg.eigh(solve_triangular(self.root, half.T, lower=True))
+            values, axes = eigh(solve_triangular(self.root, half.T, lower=True))
             t = self.by_stop.moved[self.by_stop.row[stop]]
             along = axes.T @ solve_triangular(self.root, t, lower=True)
             u = along / np.sqrt(1.0 - np.clip(values, 0.0, ALONE))

@@ -16,6 +16,8 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dsyrk
 from scipy.linalg.lapack import dpstrf
 
+from calib.linear.symmetric import eigh
+
 MIRRORED_AT_ONCE = 128  # rows and columns: a square of them stays in a cache
 
 
@@ -146,7 +148,7 @@ def inverse_and_log_det(inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     try:
         factor = np.linalg.cholesky(inner)
     except np.linalg.LinAlgError:
-        values, axes = np.linalg.eigh(inner)
+        values, axes = eigh(inner)
         values = np.maximum(values, 1.0)
         return (axes / values[..., None, :]) @ np.swapaxes(axes, -1, -2), _logs(values)
     half = np.linalg.inv(factor)

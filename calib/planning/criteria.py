@@ -22,6 +22,7 @@ from calib.blunders.chance import KNOWN, enough
 from calib.diagnosis.linear import WIDENED
 from calib.diagnosis.search.confirmed import ALPHA_EFFECT
 from calib.linear.parallel import in_order
+from calib.linear.symmetric import eigh
 from calib.planning.information import Information, inverse
 
 DESIGNS_AT_ONCE = 32  # designs whose matrices are held at once
@@ -94,7 +95,7 @@ class PredictionVariance(Criterion):
     of the S components of `known` make ``W`` (S, S) times their covariance."""
 
     def __init__(self, known: Information, W: np.ndarray) -> None:
-        values, turn = np.linalg.eigh(W)
+        values, turn = eigh(W)
         some = values > INFORMATION_ROUNDING * values[-1]
         self.start, self.root = known.data + known.paper, turn[:, some] * np.sqrt(values[some])
 

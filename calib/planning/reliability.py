@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.linear.symmetric import eigh
 from calib.planning.criteria import Criterion, Variance
 from calib.planning.information import Information, inverse
 
@@ -33,7 +34,7 @@ class Reliable(Criterion):
     def __init__(self, known: Information, of: np.ndarray, measured: np.ndarray) -> None:
         # Taken by itself a stop may seem to tell more than it does among all; none tells less
         # than nothing.
-        rest, turn = np.linalg.eigh(known.data - measured.sum(axis=0))
+        rest, turn = eigh(known.data - measured.sum(axis=0))
         self.start = known.paper + (turn * np.maximum(rest, 0.0)) @ turn.T + measured.sum(axis=0)
         now = np.sqrt(np.diag(inverse(known.data + known.paper, of)))
         self.inner, self.measured = Variance(known, of, now), list(measured)

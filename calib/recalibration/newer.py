@@ -10,6 +10,7 @@ import numpy as np
 from scipy.special import chdtrc, chdtri, chndtrinc
 
 from calib.blunders.chance import POWER
+from calib.linear.symmetric import eigh
 from calib.problem.prior import JointPrior
 from calib.problem.unknowns import Unknown
 
@@ -253,7 +254,7 @@ class _Pull(NamedTuple):
     def _units(self) -> np.ndarray:
         """(m, n) that makes it unit noise, along the axes that anything but the prior holds."""
         root = np.linalg.inv(np.linalg.cholesky(self.weight))
-        told, axes = np.linalg.eigh(root @ self.spread @ root.T)
+        told, axes = eigh(root @ self.spread @ root.T)
         use = told > 1.0 - LEFT_VARIANCE
         return (axes.T @ root)[use] / np.sqrt(told[use, None])
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.linear.symmetric import eigh
 from calib.problem.prior import JointPrior
 from calib.recalibration.newer import Force, NewerData, blocks_of
 
@@ -51,7 +52,7 @@ class MoveOdds:
         rows = np.concatenate([np.r_[self.blocks[name]] for name in freed])
         root = np.concatenate([f * self.sigma[self.blocks[name]] for name, f in freed.items()])
         some, both = np.ix_(rows, rows), np.outer(root, root)
-        told, axes = np.linalg.eigh(self.force.answer[some] * both)
+        told, axes = eigh(self.force.answer[some] * both)
         axes, told = axes[:, told > TELLS_NOTHING], told[told > TELLS_NOTHING]
         pull = axes.T @ (root * self.force.pull[rows])
         spread = axes.T @ (self.force.spread[some] * both) @ axes

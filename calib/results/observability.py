@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.linalg import qr
+from scipy.linalg import block_diag, qr
 
+from calib.linear.symmetric import eigh
 from calib.problem.unknowns import Unknown
 from calib.residuals.groups import Group
 from calib.residuals.surfaces import PlaneSurface
@@ -114,8 +115,8 @@ def not_estimated(
         A `name` and a `why` for each.
     """
     names = [f"{v.name}.{dof}" for v in variables for dof in v.dofs]
-    sigma = np.concatenate([v.sigma for v in variables])
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    root = block_diag(*(v.prior_root for v in variables))
+    values, vectors = eigh(root @ covariance @ root.T)
     untold = vectors[:, values > UNTOLD]
     of_rejected = np.concatenate([lost.get(v.name, np.zeros(v.dim, bool)) for v in variables])
     dims = [v.dim for v in variables]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from calib.forward import Placed, Stops, place
+from calib.linear.symmetric import eigh
 from calib.problem import Problem
 from calib.problem.model import Source
 from calib.residuals.tracker import TrackedBody
@@ -228,7 +229,7 @@ def placed(stops: Stops, body: str, base: str | None, values: Mapping[str, np.nd
 
 def _errors(covariance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Errors (P, n) of parameters with this covariance."""
-    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T  # of like ones, alike
     return root @ rng.normal(size=(len(covariance), DRAWN_ERRORS))
 

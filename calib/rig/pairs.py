@@ -29,6 +29,22 @@ PUSHED, CLEARLY = 0.02, 5.0
 STOPS_BESIDE = (
     10  # stops on either side, by which it is known how far the root goes from stop to stop
 )
+ARM_OFF_BY = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
+JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
+# Sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag.
+OUTLIER_SIGMAS = 8.0
+# Left by all that CAD and the arm may be off by, m and rad: not this arm, or not so.
+NOT_THIS_ARM = 0.05
+MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
+SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
+AMISS = 0.1  # of the stops, that may be wrong in another way beside half turns: a choice
+HALVES = (slice(0, 3), slice(3, 6))  # of a twist: turn and shift; 1.538 is the median of chi(3)
+# What makes q times a half turn about an axis, of q = (w, x, y, z).
+HALF_TURNS = {
+    "x": np.eye(4)[[1, 0, 3, 2]] * [[-1], [1], [1], [-1]],
+    "y": np.eye(4)[[2, 3, 0, 1]] * [[-1], [-1], [1], [1]],
+    "z": np.eye(4)[[3, 2, 1, 0]] * [[-1], [1], [-1], [1]],
+}
 
 
 @dataclass(frozen=True)
@@ -297,3 +313,75 @@ def robustly_left(A: Array, b: Array) -> tuple[Array, float]:
             break
     taken = float(np.trace(np.linalg.solve(inner + np.eye(P), inner))) / len(rows)
     return b - A @ x, taken
+
+
+def half_turned(pair: SeenPair) -> tuple[str, str, Array] | None:
+    """A body that is half a turn about one of its axes from how it hangs at other stops: which,
+    about which axis, and (K,) at which stops. None where there is none, or where more than a few
+    stops fit neither way."""
+    nominal = from_places(pair, roots_of(pair))
+
+    def hung(seen: Array) -> Array:
+        return (se3.inverse(nominal) @ seen)[:, :3, :3]
+
+    as_seen = hung(pair.seen())
+    some = as_seen[:: -(-len(as_seen) // MOST_COMPARED)]
+    usual = some[np.quantile(_apart_rad(some[:, None], some), AGREE, axis=1).argmin()]
+    alike, found = _apart_rad(usual, as_seen) < TURNED_RAD, []
+    for body in pair.names:
+        for axis, turn in HALF_TURNS.items():
+            there = ~alike & (_apart_rad(usual, hung(pair.seen(turn, (body,)))) < TURNED_RAD)
+            if there.any() and np.mean(alike | there) > 1.0 - AMISS:
+                # Where as many are turned as not, those are that are not as CAD has them.
+                turned = _apart_rad(usual, np.eye(3)) > np.pi / 2
+                found.append((body, axis, alike if turned else there))
+    return max(found, key=lambda one: one[2].sum(), default=None)
+
+
+def _apart_rad(a: Array, b: Array) -> Array:
+    """By how much rotations (..., 3, 3) differ."""
+    trace = np.einsum("...ij,...ij->...", a, b)
+    return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+
+
+def outliers(rig: Rig, pair: SeenPair) -> Iterator[tuple[int, Array, bool]]:
+    """Stops of a pair that stand out from the others: which, by how much (6,) [rad m], and whether
+    they would not if the bodies were exchanged.
+
+    The gaps between measured and nominal poses are laid on what all edges of the rig, and the
+    root's places, may be off by: weighted least squares with CAD's sigmas as priors, and Cauchy's
+    weights by stop, so that no wild one bends the rest.
+    """
+    if len(pair.stops) < 4:
+        return
+    nominal, seen = from_places(pair, roots_of(pair)), pair.seen()
+    gap = gap_of(nominal, seen)
+    noise = np.repeat([rig.tracker.sigma_rad, rig.tracker.sigma_m], 3) * np.sqrt(len(pair.names))
+    noise = np.hypot(noise, max(rig.sigma_joint_rad, JITTER))
+    d_place = se3.adjoint(se3.inverse(pair.nominal))
+    columns = [pair.d_twist, *(d_place * (pair.place == p)[:, None, None]
+               for p in np.unique(pair.place[pair.place >= 0]))]  # fmt: skip
+    A = np.concatenate(columns, axis=2) / noise[:, None]
+    prior = np.full(A.shape[2], NOT_THIS_ARM)
+    prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
+    left, taken = robustly_left(A * prior, gap / noise)
+    size = np.array([np.linalg.norm(left[:, s], axis=1) for s in HALVES]).T
+    spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
+    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > NOT_THIS_ARM).any():
+        return
+    for k in np.flatnonzero((size > OUTLIER_SIGMAS * np.maximum(spread, 1.0)).any(axis=1)):
+        exchanged = len(pair.names) == 2 and (
+            size_of(gap_of(nominal[k], se3.inverse(seen[k]))) < SWAPPED * size_of(gap[k])
+        )
+        yield int(k), left[k] * noise, bool(exchanged)
+
+
+def _edge_sigmas(rig: Rig) -> Array:
+    """(6 E,) how far each edge may be off: CAD's sigma of a frame, or what an arm's may be."""
+    sigma = [
+        np.maximum(rig.frame_sigma[name], 1e-6)
+        if name in rig.frame_sigma
+        else np.full(6, ARM_OFF_BY)
+        for name in rig.tree.edge_names
+    ]
+    return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond

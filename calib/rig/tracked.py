@@ -13,14 +13,15 @@ from calib.rig import Rig
 from calib.rig.pairs import (
     MOST_COMPARED,
     READINGS,
+    SWAPPED,
     TURNED_RAD,
     SeenPair,
     far_off,
-    from_places,
     gap_of,
+    half_turned,
+    outliers,
     pairs_of,
     pushes,
-    robustly_left,
     roots_of,
     size_of,
     turns,
@@ -31,27 +32,19 @@ from chains.se3 import Array
 from sensors.recording import RecordedStops
 
 JOINT_MOVED = 1e-3  # rad or m by which a joint has moved, if it has
-ARM_OFF_BY = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
-JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
-# Sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag.
-OUTLIER_SIGMAS = 8.0
-# Left by all that CAD and the arm may be off by, m and rad: not this arm, or not so.
-NOT_THIS_ARM = 0.05
 FITS_RAD = 0.03  # turns that are the arm's, others than those of `TURNED_RAD`
-MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
 # Stops far off, from which columns may be out of step, and of these what is left if they are: a
 # choice, as one in ten was left where columns were moved back, and all where they were not.
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
-SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
+HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far more than CAD errs by
 # What quaternions are in place of qw, qx, qy, qz, and what makes these of it.
 OTHER_QUATERNIONS = {
     "qx, qy, qz, qw": np.eye(4)[[3, 0, 1, 2]],
     "qz, qw, qx, qy": np.eye(4)[[1, 2, 3, 0]],
     "qw, -qx, -qy, -qz (the inverse turn)": np.diag([1.0, -1.0, -1.0, -1.0]),
 }
-HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far more than CAD errs by
 
 
 _Met = list[tuple[SeenPair, Array, bool]]  # pairs at a stop, how far off, whether if exchanged
@@ -69,13 +62,14 @@ def odd_bodies(rig: Rig, recording: RecordedStops) -> Iterator[str | Suspect]:
     pairs, moves = pushes([*pairs_of(rig, recording, usable)], recording.time_s)
     yield from (push.suspect(rig, recording) for push in moves)
     for pair in pairs:
+        pair = yield from _turned_round(recording, pair)
         wrong = _at_all_stops(pair) or _misread(rig, recording, pair)
         if wrong is not None:
             yield wrong
             return
         told = yield from _of_some_rows(rig, recording, pair)
         pair = pair.some(~np.isin(pair.stops, [*told]))
-        for k, gap, exchanged in _outliers(rig, pair):
+        for k, gap, exchanged in outliers(rig, pair):
             met.setdefault(int(pair.stops[k]), []).append((pair, gap, exchanged))
     at_stops: dict[tuple[str, bool], dict[str, tuple[Suspect, _Met]]] = {}
     for stop, found in sorted(met.items()):
@@ -119,6 +113,25 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
     _, first, inverse = np.unique(pose, axis=0, return_index=True, return_inverse=True)
     same[seen] = np.abs(at - at[first[inverse.ravel()]]).max(axis=1) > JOINT_MOVED
     return same
+
+
+# --------------------------------------------------------------------------------- turned round
+
+
+def _turned_round(recording: RecordedStops, pair: SeenPair) -> Generator[Suspect, None, SeenPair]:
+    """A body that is half a turn from where CAD has it at some stops and not at others; returns the
+    pair without these."""
+    if (found := half_turned(pair)) is None:
+        return pair
+    body, axis, there = found
+    at = tuple(recording.stops[k] for k in pair.stops[there])
+    said = (
+        f"at {len(at)} of {len(there)} stops ({listed(at)}) {body} is turned round by half a turn "
+        f"about its {axis} axis, against the others: markers that look the same so are seen either "
+        "way; leave its cells empty there, and move one of its markers"
+    )
+    yield Suspect("body", body, said, stops=at)
+    return pair.some(~there)
 
 
 # ------------------------------------------------------------------------------- at all stops
@@ -309,52 +322,6 @@ def _otherwise_read(rig: Rig, names: Sequence[str], read: Array) -> Iterator[tup
 
 
 # -------------------------------------------------------------------------------- at one stop
-
-
-def _outliers(rig: Rig, pair: SeenPair) -> Iterator[tuple[int, Array, bool]]:
-    """Stops of a pair that stand out from the others: which, by how much (6,) [rad m], and whether
-    they would not if the bodies were exchanged.
-
-    The gaps between measured and nominal poses are laid on what all edges of the rig, and the
-    root's places, may be off by: weighted least squares with CAD's sigmas as priors, and Cauchy's
-    weights by stop, so that no wild one bends the rest.
-    """
-    if len(pair.stops) < 4:
-        return
-    nominal, seen = from_places(pair, roots_of(pair)), pair.seen()
-    gap = gap_of(nominal, seen)
-    noise = np.repeat([rig.tracker.sigma_rad, rig.tracker.sigma_m], 3) * np.sqrt(len(pair.names))
-    noise = np.hypot(noise, max(rig.sigma_joint_rad, JITTER))
-    d_place = se3.adjoint(se3.inverse(pair.nominal))
-    columns = [pair.d_twist, *(d_place * (pair.place == p)[:, None, None]
-               for p in np.unique(pair.place[pair.place >= 0]))]  # fmt: skip
-    A = np.concatenate(columns, axis=2) / noise[:, None]
-    prior = np.full(A.shape[2], NOT_THIS_ARM)
-    prior[: pair.d_twist.shape[2]] = _edge_sigmas(rig)
-    left, taken = robustly_left(A * prior, gap / noise)
-    size = np.array([np.linalg.norm(left[:, s], axis=1) for s in _HALVES]).T
-    spread = np.median(size, axis=0) / 1.538 / np.sqrt(1.0 - min(taken, 0.99))
-    if taken > MOST_TAKEN or (spread * noise[[0, 3]] > NOT_THIS_ARM).any():
-        return
-    for k in np.flatnonzero((size > OUTLIER_SIGMAS * np.maximum(spread, 1.0)).any(axis=1)):
-        exchanged = len(pair.names) == 2 and (
-            size_of(gap_of(nominal[k], se3.inverse(seen[k]))) < SWAPPED * size_of(gap[k])
-        )
-        yield int(k), left[k] * noise, bool(exchanged)
-
-
-_HALVES = (slice(0, 3), slice(3, 6))  # of a twist: turn and shift; 1.538 is the median of chi(3)
-
-
-def _edge_sigmas(rig: Rig) -> Array:
-    """(6 E,) how far each edge may be off: CAD's sigma of a frame, or what an arm's may be."""
-    sigma = [
-        np.maximum(rig.frame_sigma[name], 1e-6)
-        if name in rig.frame_sigma
-        else np.full(6, ARM_OFF_BY)
-        for name in rig.tree.edge_names
-    ]
-    return 3.0 * np.concatenate(sigma)  # one in a hundred lies beyond
 
 
 def _those_that_last(

@@ -13,6 +13,7 @@ from calib.forward import Values
 from calib.linear.layout import StopKey, key_of
 from calib.linear.parallel import over_stops
 from calib.linear.rows import State, Weighing
+from calib.linear.symmetric import eigh
 from calib.residuals.beams import Rows
 from calib.residuals.robust import TUKEY, tukey_cost
 from calib.residuals.scan import ScanStop
@@ -138,7 +139,7 @@ def _slid(loop: Loop, guessed: Collection[str]) -> dict[str, np.ndarray]:
     for scan, own in zip(scans, over_stops(partial(_told_of, loop.values), scans), strict=True):
         if scan.stops.root in told:
             told[scan.stops.root] += own
-    along = {root: np.linalg.eigh(information)[1][:, 0] for root, information in told.items()}
+    along = {root: eigh(information)[1][:, 0] for root, information in told.items()}
     cost = {root: np.zeros(len(SLIDES_M)) for root in guessed}
     for k, by_m in enumerate(SLIDES_M.tolist()):
         loop.progress("looking where scans were taken", k, len(SLIDES_M))

@@ -11,6 +11,7 @@ from calib.linear.linearise import beams_cost
 from calib.problem.build import build, shape_steps
 from calib.problem.model import Model
 from calib.problem.problem import Block, Problem
+from calib.problem.spread import spread_of
 from calib.solve.added import declared
 from calib.solve.around import look_around
 from calib.solve.descent import AT_OPTIMUM, LAST, SLOWED, STEADY, UPHILL
@@ -272,8 +273,10 @@ def fitted_as(
         start: an earlier fit to start from.
         progress: as of `solve`.
     """
-    state = {name: x for name, x in start.state.items() if not name.endswith(SD)}
-    loop = Loop(weighted_as(problem, like), None, progress, Start(state, start.met, like.set_aside))
+    problem = weighted_as(problem, like)
+    spreads = {f"{key}{SD}" for key in spread_of(problem)}  # those of the other fit stay
+    state = {name: x for name, x in start.state.items() if name not in spreads}
+    loop = Loop(problem, None, progress, Start(state, start.met, like.set_aside))
     if problem.scans:
         loop.fix_association(loop.seen_before(), start.met)
         loop.descend_roughly()

@@ -13,7 +13,7 @@ from calib.problem.spread import spread_of
 from calib.problem.unknowns import Key
 from calib.runs import diagnose as diagnosing
 from calib.runs.asked.commands import command_without
-from calib.runs.asked.in_place import Change, InPlace, Untried, in_place, rivals_told
+from calib.runs.asked.in_place import InPlace, OtherEstimate, Untried, in_place, rivals_told
 from calib.runs.calibrate import calibrate
 from calib.runs.reopen import stand_of
 from sensors.documents import read_json
@@ -118,7 +118,7 @@ def test_costs_are_compared_with_rows_that_scatter_alike(tmp_path):
 
 def test_what_fits_far_better_in_its_place_is_no_adequate_model(flexing, monkeypatch):
     run, _, grown = flexing
-    told = dict(change=Change("mount.tx", 1e-3, "m", 2.0), separate="stops", alike=False)
+    told = dict(change=OtherEstimate("mount.tx", 1e-3, "m", 2.0), separate="stops", alike=False)
     better = InPlace("base_flex", "arm_gravity_sag", odds=0.01, **told)
     monkeypatch.setattr(diagnosing, "in_place", lambda *_: iter([better]))
     found = diagnose(grown)

@@ -25,6 +25,7 @@ from calib.blunders.judged import Blunder
 from calib.blunders.others import Others
 from calib.blunders.told import SHOWN, otherwise
 from calib.effects import Scatter, Site
+from calib.linear.symmetric import eigh, pinv
 from calib.problem.model import labels
 from calib.residuals.groups import Group
 from calib.solve.components.told import DIRECTION_SEEN, Told, told
@@ -141,7 +142,7 @@ def _seen(rows: Told, count: int) -> np.ndarray:
 
 def _by_themselves(rows: Told, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Values (K, r) of so many members as their rows alone have them, and their covariances."""
-    inverse = np.linalg.pinv(rows.information, rcond=DIRECTION_SEEN, hermitian=True)
+    inverse = pinv(rows.information, DIRECTION_SEEN)
     size = len(inverse) // count
     each = np.arange(count)
     blocks = inverse.reshape(count, size, count, size)[each, :, each]
@@ -213,7 +214,7 @@ def _ball(values: np.ndarray, covariance: np.ndarray) -> tuple[float, np.ndarray
         return None
     # In units of their sizes; m and rad in one matrix, or what rounding leaves, may have no root.
     size = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), NO_SD**2))
-    variance, axes = np.linalg.eigh(covariance / (size[:, :, None] * size[:, None]))
+    variance, axes = eigh(covariance / (size[:, :, None] * size[:, None]))
     along = np.vecmat(values / size, axes) / np.sqrt(np.maximum(variance, LEAST_VARIANCE))
     z = np.matvec(axes, along)  # the axes of one are not those of another
     tail, (order,), (number,) = _tails(z[None])

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import POWER
+from calib.linear.symmetric import eigh
 from calib.solve.components.told import DIRECTION_SEEN, Told
 
 SCATTER_DRAWS = 2000  # of chance: their mean, from which p-values follow, is known to some 5 %
@@ -22,7 +23,7 @@ class AtZero:
     """
 
     def __init__(self, told: Told) -> None:
-        values, axes = np.linalg.eigh(told.information)
+        values, axes = eigh(told.information)
         seen = values > DIRECTION_SEEN * max(values[-1], 0.0)
         self.l = values[seen]
         self.w = np.square(axes[:, seen].T @ told.score) / self.l

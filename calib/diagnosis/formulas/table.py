@@ -24,6 +24,7 @@ from calib.linear.clusters import Gradients, over_all, summed
 from calib.linear.layout import Layout
 from calib.linear.own import own_rows
 from calib.linear.rows import TWIST
+from calib.linear.symmetric import eigh
 from calib.problem import Problem
 from calib.residuals.robust import MAD
 from calib.solve.added import HUBER
@@ -350,7 +351,7 @@ def _wider(left: Matrix, right: np.ndarray) -> Matrix:
 
 def _explained(score: np.ndarray, whole: np.ndarray, left: np.ndarray) -> tuple[float, int]:
     size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    values, axes = np.linalg.eigh(left / np.outer(size, size))
+    values, axes = eigh(left / np.outer(size, size))
     seen = values > GAUGE
     along = (score / size) @ axes[:, seen]
     return float(np.sum(np.square(along) / values[seen])), int(seen.sum())

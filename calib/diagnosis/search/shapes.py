@@ -13,6 +13,7 @@ from calib.diagnosis.score import ScoreTest, project, score_test
 from calib.diagnosis.stand import Stand, tried
 from calib.effects import Effect, ShapeStep
 from calib.forward import named
+from calib.linear.symmetric import pinv
 from calib.problem.build import shapes_of, stops_view, theta_of
 from calib.solve.estimate import DOFS, SEEN
 from calib.solve.fit import Progress
@@ -103,7 +104,7 @@ def _further(stand: Stand, step: ShapeStep, test: ScoreTest) -> tuple[float, flo
     derivative ``u^2 / M``, what its best step gains; of another shape ``2 u - M``, what going there
     does, no more and no less.
     """
-    u, M = test.score.sum(), np.linalg.pinv(test.whiten @ test.whiten.T, hermitian=True).sum()
+    u, M = test.score.sum(), pinv(test.whiten @ test.whiten.T).sum()
     effect = step.effect
     if step.to is not None:
         return float(2.0 * u - M), step.to

@@ -22,6 +22,7 @@ from calib.diagnosis.stand import Look, Stand, tried, variables_of
 from calib.diagnosis.verdict.matters import as_good
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.effects import Effect, Site
+from calib.linear.symmetric import pinv
 from calib.problem.build import shapes_of
 from calib.results.errors import Errors
 from calib.results.holdout import Fall
@@ -133,6 +134,6 @@ def _likeness(
     for name, columns in at.items():
         these = count + columns
         cross = information[these, :count] @ theta
-        took = cross @ np.linalg.pinv(information[np.ix_(these, these)], hermitian=True) @ cross
+        took = cross @ pinv(information[np.ix_(these, these)]) @ cross
         share[name] = float(took / max(whole, 1e-300))
     return share

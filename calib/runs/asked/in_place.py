@@ -39,7 +39,7 @@ class InPlace:
     effect: str
     rival: str
     odds: float
-    change: Change
+    change: OtherEstimate
     separate: str
     alike: bool
 
@@ -66,7 +66,7 @@ class InPlace:
         return own | self.change._asdict()
 
 
-class Change(NamedTuple):
+class OtherEstimate(NamedTuple):
     """By how much an estimate differs between two fits.
 
     Args:
@@ -146,9 +146,10 @@ def in_place(
         told = every[effect.name]
         for rival in sorted(told["rivals"], key=lambda each: each["odds"])[:MOST_IN_PLACE]:
             name = rival["add"]
-            if name.partition("@")[0] in there:
+            known = _known(stand, name)
+            if known and known.family in there:
                 continue
-            other = _instead(run, stand, effect, name, progress)
+            other = _instead(run, stand, effect, known, progress)
             if isinstance(other, str):
                 yield Untried(effect.name, name, other)
                 continue
@@ -172,14 +173,22 @@ def to_be_told(some: Sequence[InPlace]) -> list[str]:
     )
 
 
-def _instead(run: Run, stand: Stand, effect: Effect, rival: str, progress: Progress) -> Stand | str:
-    """The model's fit with a rival in place of an effect; why there is none."""
+def _known(stand: Stand, name: str) -> Effect | None:
+    """The effect of that name; None where it is of a file that is given no more."""
+    own = (each for each in stand.own if each.name == name)
+    try:
+        return next(own, None) or find(name)
+    except InputError:
+        return None
+
+
+def _instead(
+    run: Run, stand: Stand, effect: Effect, other: Effect | None, progress: Progress
+) -> Stand | str:
+    """The model's fit with another effect in place of one; why there is none."""
     if run.prior:
         return "this run rests on an earlier one"
-    own = (each for each in stand.own if each.name == rival)
-    try:
-        other = next(own, None) or find(rival)
-    except InputError:
+    if other is None:
         return "its file is not among the candidates"
     model = stand.model.minus([effect.name]).plus((other,))
     fitted = tried(stand.compared, model, stand.estimate.start, progress)
@@ -188,7 +197,7 @@ def _instead(run: Run, stand: Stand, effect: Effect, rival: str, progress: Progr
     return fitted
 
 
-def _furthest(run: Run, stand: Stand, other: Stand) -> Change:
+def _furthest(run: Run, stand: Stand, other: Stand) -> OtherEstimate:
     """Of the estimates that both have the one that differs most in its sigmas."""
     sigma = dict(zip(run.solution.keys, np.sqrt(np.diag(run.solution.covariance)), strict=True))
     there: Mapping[str, np.ndarray] = other.estimate.values
@@ -197,5 +206,5 @@ def _furthest(run: Run, stand: Stand, other: Stand) -> Change:
         change = unknown.difference(stand.estimate.values[unknown.name], there[unknown.name])
         for dof, unit, by in zip(unknown.dofs, unknown.units, change.tolist(), strict=True):
             if own := sigma.get(key := Key(unknown.name, dof)):
-                found.append(Change(key.name, by, unit, float(abs(by) / own)))
-    return max(found, key=lambda each: each.sigmas, default=Change())
+                found.append(OtherEstimate(key.name, by, unit, float(abs(by) / own)))
+    return max(found, key=lambda each: each.sigmas, default=OtherEstimate())

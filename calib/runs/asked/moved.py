@@ -23,6 +23,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.effects import GEOMETRY
+from calib.linear.symmetric import eigh
 from calib.problem.prior import JointPrior
 from calib.recalibration.letgo import ALARM, let_go
 from calib.recalibration.links import Link
@@ -219,7 +220,7 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
 
 def _nowhere_negative(matrix: np.ndarray) -> np.ndarray:
     """The nearest symmetric matrix without negative eigenvalues: those that it has are rounding."""
-    values, axes = np.linalg.eigh((matrix + matrix.T) / 2)
+    values, axes = eigh((matrix + matrix.T) / 2)
     return (axes * np.maximum(values, 0.0)) @ axes.T
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.linear.symmetric import eigh
+
 # Of a variance; no less and no more is found at once. Joints read to 0.1 mrad may scatter by 1 rad.
 GROWN = np.geomspace(1e-3, 1e8, 78) - 1.0
 UNSEEN_REDUNDANCY = 1e-6  # of a redundancy: rounding of a covariance is some 1e-9 of it
@@ -40,7 +42,7 @@ class Checks:
     def of(cls, residual: np.ndarray, redundancy: np.ndarray) -> Checks:
         """Of residuals (..., m) whose covariance is the redundancy (..., m, m), where sigmas are
         right."""
-        values, axes = np.linalg.eigh(redundancy)
+        values, axes = eigh(redundancy)
         seen = values > UNSEEN_REDUNDANCY  # in the others nothing checks the rows: residuals are 0
         square = np.square(np.vecmat(residual, axes))[seen]
         return cls(square, np.minimum(values[seen], 1.0), np.ones(int(seen.sum())))

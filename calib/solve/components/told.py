@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from calib.linear.elimination import inverse_and_log_det
+from calib.linear.symmetric import pinv
 from calib.problem.spread import spread_keys
 from calib.problem.unknowns import Unknown
 
@@ -105,7 +106,7 @@ class Told:
         """The values (..., Q) as all rows have them that know of no spread: with u as they are
         given one, ``g^T (M + M D M)^-1 g`` is this times ``D^-1 u``, without a difference of large
         numbers."""
-        inverse = np.linalg.pinv(self.information, rcond=DIRECTION_SEEN, hermitian=True)
+        inverse = pinv(self.information, DIRECTION_SEEN)
         return (inverse @ self.score[..., None])[..., 0]
 
     def of(self, *groups: int) -> Told:
@@ -226,7 +227,7 @@ def _likeliest(
 def _sigma(sd: np.ndarray, of_variances: np.ndarray) -> np.ndarray:
     """Of sds (G,), from the information (G, G) of their variances."""
     scale = np.sqrt(np.maximum(np.diag(of_variances), 1e-300))
-    inverse = np.linalg.pinv(of_variances / np.outer(scale, scale)) / np.outer(scale, scale)
+    inverse = pinv(of_variances / np.outer(scale, scale)) / np.outer(scale, scale)
     of_variance = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     beyond = np.sqrt(np.square(sd) + of_variance) - sd
     return np.where(of_variance < 2 * np.square(sd), of_variance / (2 * sd), beyond)
