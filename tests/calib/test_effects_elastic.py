@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 import calib
 from calib.diagnosis.candidates import NO_MASSES, lacking
@@ -12,7 +13,7 @@ from calib.effects import CATALOGUE, View, find
 from calib.problem.build import stops_view
 from calib.problem.model import Source
 from calib.rig.columns import recorded_columns, stop_columns
-from calib.simulation import load_spec
+from calib.simulation import Spec, load_spec
 from chains.errors import InputError
 
 from . import rigs, two_arms
@@ -214,6 +215,48 @@ def test_the_mount_bends_down(source):
     # By an angle of 1 mrad times the sine between lever and gravity, at arm's length of the lever.
     np.testing.assert_allclose(fall, 1e-3 * across**2 / np.linalg.norm(lever, axis=1), atol=1e-7)
     assert fall.max() > 2e-5
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mast_that_bends_falls_and_turns_as_a_cantilever_does(source, axis):
+    """Its tip goes along what of gravity is across it, and turns about the axis across both."""
+    effect, n = find("body_bending"), np.eye(3)[axis]
+    sag_m, turn_rad = 2e-3, 0.01
+    K = sag_m * (np.eye(3) - np.outer(n, n))
+    theta = np.r_[K[np.triu_indices(3)], turn_rad * n]
+    names = [param.name for param in effect.params(source.rig)]
+    assert names[:3] == [f"mount_markers.{name}" for name in ("xx", "xy", "xz")]
+    at = source.rig.tracker.bodies.index("mount_markers")
+    basis = effect.basis(stops_of(source))
+    assert not np.delete(basis, at, axis=1).any(), "bodies before the joints"
+    turn, shift = np.split(basis[:, at] @ theta, 2, axis=1)
+    R = source.rig.tree.place("mount_markers", source.recording.joints).Ts_root_frame[:, :3, :3]
+    mast, down = R @ n, np.array([0.0, 0.0, -1.0])
+    across = down - mast * (mast @ down)[:, None]
+    np.testing.assert_allclose(np.matvec(R, shift), sag_m * across, atol=1e-12)
+    np.testing.assert_allclose(np.matvec(R, turn), turn_rad * np.cross(mast, down), atol=1e-12)
+    assert np.linalg.norm(across, axis=1).max() > 0.5
+
+
+@pytest.mark.long
+def test_a_mast_of_markers_that_bends_is_named(tmp_path):
+    """The height of the arm was 6 to 7 sigmas off, and all was called adequate."""
+    spec = Spec(lidar=None, mesh=False, targets=0, locations=6, stops_per_location=12)
+    made(tmp_path / "rec", spec, 2)
+    n, at = np.array([0.0, 0.0, 1.0]), "mount_markers"
+    pose = pd.read_csv(tmp_path / "rec/stops.csv")
+    seen = pose[[f"{at}.q{c}" for c in "wxyz"]].fillna(1.0)  # what was not seen stays empty
+    mast, down = Rotation.from_quat(seen, scalar_first=True).apply(n), np.array([0.0, 0.0, -1.0])
+    pose[[f"{at}.{c}" for c in "xyz"]] += 0.002 * (down - mast * (mast @ down)[:, None])
+    pose.to_csv(tmp_path / "rec/stops.csv", index=False)
+    run = calib.fit(tmp_path / "rec", tmp_path / "run")
+    assert calib.diagnose(run).worth_adding == ["body_bending"]
+    grown = calib.add(run, "body_bending", tmp_path / "grown")
+    assert calib.diagnose(grown).verdict == "adequate"
+    found = grown.solution.shared.effects["body_bending"]
+    told = dict(zip(found.names, found.estimate, strict=True))
+    assert told[f"{at}.xx"] - told[f"{at}.zz"] == pytest.approx(0.002, abs=3e-4)
+    assert told[f"{at}.xy"] == pytest.approx(0.0, abs=3e-4)
 
 
 @pytest.mark.long
