@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -19,16 +20,13 @@ READINGS = "joints"  # whose columns may belong to other stops, as those of bodi
 # Turns, in rad, that are not the arm's; and how far off, rad and m alike, no CAD or arm is.
 TURNED_RAD = 0.1
 MOST_COMPARED = 100  # stops, each with each
-# Of the stops of a place, which agree where it is: a choice, below half, as half of a table may be
-# out of step.
+# Of a place's stops, which agree where it is: a choice; half of a table may be out of step.
 AGREE = 0.3
 MOST_FITTED = 1000  # stops, to which what is unknown is fitted; all are held against it
 # How far the root went between two stops, rad and m alike: fits end with 0.02 m, and name it; with
 # 0.05 m they did not end. How many times further than from stop to stop elsewhere: a choice.
 PUSHED, CLEARLY = 0.02, 5.0
-STOPS_BESIDE = (
-    10  # stops on either side, by which it is known how far the root goes from stop to stop
-)
+STOPS_BESIDE = 10  # on either side, that tell how far the root goes from stop to stop
 ARM_OFF_BY = 0.005  # rad and m that arms' joints and links are off by; those measured, by 0.003
 JITTER = 1e-4  # rad by which joints scatter at least, as of industrial arms
 # Sigmas; of 21 sound recordings 3.7 at most, 7.4 where a load changes how joints sag.
@@ -37,6 +35,7 @@ OUTLIER_SIGMAS = 8.0
 NOT_THIS_ARM = 0.05
 MOST_TAKEN = 0.5  # of the rows by what is unknown: more, and what is left of the others says little
 SWAPPED = 0.2  # of the misfit, left where two bodies are exchanged
+HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far more than CAD errs by
 AMISS = 0.1  # of the stops, that may be wrong in another way beside half turns: a choice
 HALVES = (slice(0, 3), slice(3, 6))  # of a twist: turn and shift; 1.538 is the median of chi(3)
 # What makes q times a half turn about an axis, of q = (w, x, y, z).
@@ -328,20 +327,32 @@ def half_turned(pair: SeenPair) -> tuple[str, str, Array] | None:
     some = as_seen[:: -(-len(as_seen) // MOST_COMPARED)]
     usual = some[np.quantile(_apart_rad(some[:, None], some), AGREE, axis=1).argmin()]
     alike, found = _apart_rad(usual, as_seen) < TURNED_RAD, []
-    for body in pair.names:
-        for axis, turn in HALF_TURNS.items():
-            there = ~alike & (_apart_rad(usual, hung(pair.seen(turn, (body,)))) < TURNED_RAD)
-            if there.any() and np.mean(alike | there) > 1.0 - AMISS:
-                # Where as many are turned as not, those are that are not as CAD has them.
-                turned = _apart_rad(usual, np.eye(3)) > np.pi / 2
-                found.append((body, axis, alike if turned else there))
+    for body, (axis, turn) in product(pair.names, HALF_TURNS.items()):
+        there = ~alike & (_apart_rad(usual, hung(pair.seen(turn, (body,)))) < TURNED_RAD)
+        if there.any() and np.mean(alike | there) > 1.0 - AMISS:
+            # Where as many are turned as not, those are that are not as CAD has them.
+            turned = _apart_rad(usual, np.eye(3)) > np.pi / 2
+            found.append((body, axis, alike if turned else there))
     return max(found, key=lambda one: one[2].sum(), default=None)
+
+
+def hung_otherwise(pair: SeenPair) -> tuple[str, str] | None:
+    """Of two bodies the one that is half a turn about one of its axes from how CAD has it, at all
+    stops, and about which axis; None where neither is, or only one body is seen."""
+    if len(pair.names) < 2:
+        return None
+
+    def fits(seen: Array, within_rad: float) -> bool:
+        R = (se3.inverse(pair.nominal) @ seen)[:, :3, :3]
+        return bool(np.mean(_apart_rad(R, np.eye(3)) < within_rad) > 1.0 - AMISS)
+
+    every = product(pair.names, HALF_TURNS.items() if not fits(pair.seen(), np.pi / 2) else ())
+    return next(((b, a) for b, (a, turn) in every if fits(pair.seen(turn, (b,)), HANGS_RAD)), None)
 
 
 def _apart_rad(a: Array, b: Array) -> Array:
     """By how much rotations (..., 3, 3) differ."""
-    trace = np.einsum("...ij,...ij->...", a, b)
-    return np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+    return np.arccos(np.clip((np.einsum("...ij,...ij->...", a, b) - 1.0) / 2.0, -1.0, 1.0))
 
 
 def outliers(rig: Rig, pair: SeenPair) -> Iterator[tuple[int, Array, bool]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.rig.pairs import (
+    HANGS_RAD,
     MOST_COMPARED,
     READINGS,
     SWAPPED,
@@ -19,6 +20,7 @@ from calib.rig.pairs import (
     far_off,
     gap_of,
     half_turned,
+    hung_otherwise,
     outliers,
     pairs_of,
     pushes,
@@ -38,7 +40,6 @@ FITS_RAD = 0.03  # turns that are the arm's, others than those of `TURNED_RAD`
 FEWEST_OFF, OUT_OF_STEP = 3, 0.25
 TURNED_DEG = (-90, 90, 180)  # by which zeros of joints are drawn otherwise
 SLIPPED = (-2, -1, 1, 2)  # stops by which columns are out of step: as far as tables slip, a choice
-HANGS_RAD = 0.5  # by which bodies hang otherwise than CAD says: a choice, far more than CAD errs by
 # What quaternions are in place of qw, qx, qy, qz, and what makes these of it.
 OTHER_QUATERNIONS = {
     "qx, qy, qz, qw": np.eye(4)[[3, 0, 1, 2]],
@@ -149,6 +150,14 @@ def _at_all_stops(pair: SeenPair) -> Suspect | None:
         if apart > TURNED_RAD and swapped < SWAPPED * apart:
             said = f"{names} lie as CAD says if they are exchanged; is each named as it should be?"
             return Suspect("body", names, said)
+    if found := hung_otherwise(pair):
+        body, axis = found
+        said = (
+            f"{names} turn against each other as CAD says if {body} is turned round by half a turn "
+            f"about its {axis} axis: is it drawn, or what lies between the two, the other way "
+            "round in rig.yaml?"
+        )
+        return Suspect("body", body, said)
     if turns(pair, seen)[0] < TURNED_RAD:
         return None
     ways = {  # columns of all bodies, or of one of them

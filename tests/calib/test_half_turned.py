@@ -37,3 +37,13 @@ def test_a_body_whose_markers_look_the_same_half_a_turn_on_is_told(shared, name,
     assert (told.name, told.kind) == (body, "body")
     assert f"half a turn about its {axis} axis" in told.sentence
     assert list(told.stops) == [recording.stops[k] for k in rows]
+
+
+@pytest.mark.parametrize(("body", "axis"), [(MOUNT, "x"), (BASE, "z")])
+def test_a_body_that_is_drawn_the_other_way_round_is_told(shared, body, axis):
+    """The arm's base, or its first joint, was blamed instead."""
+    rig, recording = opened(shared, "known_nothing_hidden")
+    every = np.flatnonzero(np.isfinite(recording.bodies[body]).all(axis=1))
+    (told,) = odd_bodies(rig, changed(recording, body, every, half_turned(axis)))
+    assert (told.name, told.stops) == (body, ())
+    assert f"if {body} is turned round by half a turn about its {axis} axis" in told.sentence
