@@ -25,14 +25,21 @@ def quiet(*told):
     """Nothing."""
 
 
-def of_a_body(errors, time_s=None, turn=None, joints=None):
+def of_a_body(errors, time_s=None, turn=None, joints=None, poses=None):
     """A problem and its blunders: errors (K, r) of a body at the stops of a table, with the times
-    of these; what turns (K, r, r) the rows' own axes to theirs; and how joints (K, J) stood."""
+    of these; what turns (K, r, r) the rows' own axes to theirs; how joints (K, J) stood; and where
+    the body was seen (K, 4, 4)."""
     stops = STOPS[: len(errors)]
     time_s = np.full(len(stops), np.nan) if time_s is None else time_s  # as of no times
     joints = np.zeros((len(stops), 0)) if joints is None else joints
     recording = SimpleNamespace(stops=stops, time_s=time_s, joints=joints)
-    problem = SimpleNamespace(sources=[SimpleNamespace(recording=recording)])
+    rig = SimpleNamespace(tracker=None, lidar_frame=None)
+    if poses is not None:
+        rig.tracker, rig.joints_to = SimpleNamespace(bodies=["tool"]), lambda body: ["joint"]
+        rig.tree = SimpleNamespace(place=lambda *_: SimpleNamespace(Ts_root_frame=poses))
+        quat = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+        recording.bodies = {"tool": np.hstack([poses[:, :3, 3], quat])}
+    problem = SimpleNamespace(sources=[SimpleNamespace(recording=recording, rig=rig)])
     known = 2.0 * np.eye(errors.shape[1])
     blunders = [
         SimpleNamespace(
@@ -125,6 +132,47 @@ def test_errors_that_go_with_the_pose_are_alike_where_the_arm_stands_again():
     p = np.array([of_pose(rng.normal(size=(30, 3)), poses) for _ in range(2000)])
     assert np.mean(p < 0.05) == pytest.approx(0.05, abs=0.015)
     assert np.mean(p < 0.5) == pytest.approx(0.5, abs=0.03)
+
+
+def at_random(rng, count=60):
+    """Poses of a body (K, 4, 4), none twice."""
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.random(count, rng).as_matrix(), rng.normal(size=(count, 3))
+    return T
+
+
+def near_pose(errors, T):
+    """How often chance makes errors (K, r) so much alike where a body is nearly as turned."""
+    problem, blunders = of_a_body(errors, poses=T)
+    return p_of_pose(find("tracker_scatter"), SimpleNamespace(problem=problem), blunders)
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        lambda T: np.diag([1.0, 1.0, 0.2]) @ T[:, 2, :3, None],  # up in its axes: a mast that bends
+        lambda T: T[:, :3, :1] - 0.5 * T[:, :3, 1:2],  # as the tracker sees it turned
+        lambda T: np.sin(T[:, :3, 3:]),  # where it is
+    ],
+)
+def test_errors_that_go_with_how_a_body_hangs_or_is_seen_are_not_random(of):
+    """Half of the error is noise, and no pose is taken twice."""
+    rng = np.random.default_rng(8)
+    T = at_random(rng)
+    with_it = of(T)[..., 0]
+    errors = with_it / with_it.std() + rng.normal(size=(60, 3))
+    assert near_pose(errors, T) < 0.01
+    assert near_pose(rng.permutation(errors), T) > 0.01
+
+
+def test_random_errors_of_poses_that_lie_anywhere_seldom_seem_to_go_with_them():
+    rng, p = np.random.default_rng(9), []
+    T = at_random(rng)
+    for _ in range(600):
+        wide = np.where(rng.random(60) < 0.1, 10.0, 1.0)[:, None]
+        p.append(near_pose(wide * rng.normal(size=(60, 3)), T))
+    for level in (0.01, 0.05):
+        assert np.mean(np.array(p) < level) < level + 3 * np.sqrt(level * (1 - level) / len(p))
 
 
 def test_values_of_stops_are_taken_as_the_stops_were_made():

@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy import special
+from scipy.spatial import cKDTree
 
 from calib.blunders.chance import at_least
 from calib.blunders.judged import Blunder
@@ -24,7 +25,8 @@ from calib.blunders.others import Others
 from calib.diagnosis.suggest import all_of
 from calib.effects import Scatter, Site
 from calib.problem import Problem
-from calib.problem.model import labels
+from calib.problem.model import Source, labels
+from chains import se3
 from sensors.stops import in_time
 
 ALPHA_SERIAL = 0.01  # share of random errors that are said not to be: a choice, it names nothing
@@ -44,12 +46,16 @@ def p_serial(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
         others: all rows of the fit of that model.
         blunders: all groups of them, as `judge` has them.
     """
-    return _least(_series(effect, others, blunders), _in_time(others.problem))
+    return _least(_series(effect, others, blunders), [_in_time(others.problem)])
 
 
 def p_of_pose(effect: Scatter, others: Others, blunders: list[Blunder]) -> float:
-    """The same of stops in which the arm has the same pose."""
-    return _least(_series(effect, others, blunders), _in_pose(others.problem))
+    """The same of stops in which the arm has the same pose, or what it carries is nearly as much
+    turned against gravity, or seen by the tracker nearly so turned, or nearly there."""
+    problem = others.problem
+    each = [[*_views(source)] for source in problem.sources]
+    near = (_nearest(problem, views) for views in zip(*each, strict=True)) if all(each) else ()
+    return _least(_series(effect, others, blunders), [_in_pose(problem), *near])
 
 
 def _series(
@@ -99,9 +105,56 @@ def _in_pose(problem: Problem) -> Pairs:
     return pairs
 
 
-def _least(series: Iterable[tuple[list[StopKey], np.ndarray]], pairs: Pairs) -> float:
-    """The least p-value of some series, how many there are being paid for."""
-    each = ((errors, pairs(stops)) for stops, errors in series)
+def _views(source: Source) -> Iterator[np.ndarray]:
+    """What an error may go with (K, d) each, NaN where it is not known: which way up is for what
+    the arm carries; how the tracker sees it turned; and where."""
+    rig, recording = source.rig, source.recording
+    bodies = [b for b in (rig.tracker.bodies if rig.tracker else ()) if rig.joints_to(b)]
+    frame = next((f for f in (rig.lidar_frame, *bodies) if f and rig.joints_to(f)), None)
+    if frame:
+        yield rig.tree.place(frame, recording.joints).Ts_root_frame[:, 2, :3]
+    for pose in (recording.bodies[body] for body in bodies[:1]):
+        yield se3.from_xyz_quat(pose[:, :3], pose[:, 3:])[:, :3, :3].reshape(-1, 9)
+        yield pose[:, :3]
+
+
+def _nearest(problem: Problem, views: Sequence[np.ndarray]) -> Pairs:
+    """Pairs of stops of a recording, each with that whose view (K, d) is nearest to its own; these
+    make no rings, so that signs of no two products depend on each other.
+
+    Args:
+        problem: with its sources.
+        views: of each of these, as of `_views`.
+    """
+    at = {
+        (of, stop): (of, view)
+        for source, of, some in zip(problem.sources, labels(problem.sources), views, strict=True)
+        for stop, view in zip(source.recording.stops, some, strict=True)
+        if np.isfinite(view).all()
+    }
+
+    def pairs(stops: Sequence[StopKey]) -> np.ndarray:
+        mine: dict[str, list[int]] = {}
+        for k, stop in enumerate(stops):
+            if stop in at:
+                mine.setdefault(at[stop][0], []).append(k)
+        found: set[tuple[int, int]] = set()
+        for some in (some for some in mine.values() if len(some) > 1):
+            view = np.stack([at[stops[k]][1] for k in some])
+            if np.ptp(view, axis=0).max() < SAME_POSE:
+                continue  # all alike, so nothing goes with it
+            _, two = cKDTree(view).query(view, k=2)
+            other = np.where(two[:, 0] == np.arange(len(some)), two[:, 1], two[:, 0])
+            each = np.sort(np.stack([some, np.take(some, other)], axis=1), axis=1)
+            found |= set(map(tuple, each.tolist()))
+        return np.array(sorted(found), int).reshape(-1, 2)
+
+    return pairs
+
+
+def _least(series: Iterable[tuple[list[StopKey], np.ndarray]], pairings: Sequence[Pairs]) -> float:
+    """The least p-value of some series by some pairings, how many there are being paid for."""
+    each = ((errors, pairs(stops)) for stops, errors in series for pairs in pairings)
     p = [_alike(errors, some) for errors, some in each if len(some) >= FEWEST_PAIRS]
     return min(1.0, len(p) * min(p)) if p else 1.0
 
@@ -115,7 +168,7 @@ def drifting(problem: Problem, blunders: list[Blunder], names: Sequence[str]) ->
         blunders: of its rows, as `judge` has them.
         names: of effects that go with time and were found; a step, say.
     """
-    p = _least(_of_rows("body", blunders), _in_time(problem))
+    p = _least(_of_rows("body", blunders), [_in_time(problem)])
     if p < ALPHA_SERIAL:
         looks = all_of(names)
         beside, mistaken = "", ""
@@ -136,7 +189,7 @@ def random_or_not(p_adjusted: float, p_serial: float, p_of_pose: float) -> str:
         return f"random as far as these data show (p = {p_adjusted:.1g})"
     if p_of_pose < p_serial:
         return (
-            "not at random, as stops in which the arm has the same pose err alike (p = "
+            "not at random, as stops in which the arm has the same pose, or nearly, err alike (p = "
             f"{at_least(p_of_pose):.1g}): the error goes with the pose"
         )
     return (
