@@ -193,6 +193,9 @@ def _of_some_rows(
         suspect, rows = said
         yield suspect
         return rows
+    if mixed := _mixed_up(rig, recording, pair, off):
+        yield mixed
+        return off
     still = yield from _stood_still(rig, recording, pair, off)
     return still or (yield from _for_a_while(rig, recording, pair, off))
 
@@ -263,6 +266,24 @@ def _out_of_step(
     return Suspect("body", names, said), {*rows_told}
 
 
+def _mixed_up(rig: Rig, recording: RecordedStops, pair: SeenPair, off: set[int]) -> Suspect | None:
+    """Most readings belong to other stops, in no order, as two bodies see them."""
+    if len(pair.names) < 2 or 2 * len(off) < len(pair.stops):
+        return None
+    far = pair.some(np.flatnonzero(np.isin(pair.stops, [*off]))[:MOST_COMPARED])
+    read = np.isfinite(recording.joints).all(axis=1)
+    every = pair.reading(rig, recording.joints[read]).nominal
+    fits = size_of(gap_of(every[None], far.seen()[:, None])) < TURNED_RAD
+    if np.mean(fits.sum(axis=1) == 1) < 1.0 - OUT_OF_STEP:
+        return None
+    names = " and ".join(pair.names)
+    said = (
+        f"at {len(off)} of {len(pair.stops)} stops {names} would fit the joints of another stop: "
+        "are rows of stops.csv mixed up?"
+    )
+    return Suspect("body", names, said)
+
+
 def _stood_still(
     rig: Rig, recording: RecordedStops, pair: SeenPair, off: set[int]
 ) -> Generator[Suspect, None, set[int]]:
@@ -323,6 +344,9 @@ def _otherwise_read(rig: Rig, names: Sequence[str], read: Array) -> Iterator[tup
         for deg in TURNED_DEG if kind[name] == "revolute" else ():
             way = "more" if deg > 0 else "less"
             yield f"{name} read {abs(deg)} deg {way}", but({name: q[name] + np.radians(deg)})
+    along = [name for name in q if name in names]  # the chain
+    back = [q[name] for name in along[::-1]]
+    yield "all joints were in reverse order", but(dict(zip(along, back, strict=True)))
     for a, b in combinations(names, 2):
         yield f"the columns of {a} and {b} were exchanged", but({a: q[b], b: q[a]})
     for a, b in permutations(names, 2):  # rods hold links level, wrists are driven through others

@@ -42,6 +42,15 @@ def test_an_arm_alone_whose_joints_are_a_row_late(shared):
     assert found.sentence.startswith("tool would lie where CAD and joints put it if")
 
 
+def test_rows_of_joints_in_another_order_than_those_of_bodies_are_told(sound):
+    """As where one table was sorted: no column is a row late, and no stop is to blame."""
+    rig, recording = sound
+    order = np.random.default_rng(3).permutation(len(recording.stops))
+    found = only(odd_bodies(rig, replace(recording, joints=recording.joints[order])))
+    assert "would fit the joints of another stop: are rows of stops.csv mixed" in found.sentence
+    assert found.stops == ()
+
+
 @pytest.mark.parametrize(("first", "last"), [(10, 16), (100, 119), (150, 299)])
 def test_some_rows_of_an_arm_are_out_of_step(shared, first, last):
     """From a row on, or between two: most rows may be good, or most bad."""
@@ -72,6 +81,7 @@ def test_rows_that_have_nothing_in_common_are_not_out_of_step(shared):
         (lambda q: q * [1, -1, 1, 1, 1, 1], "joint_2 had the other sign"),
         (lambda q: q * [1, 1, 1, 1, -1, 1], "joint_5 had the other sign"),
         (lambda q: q[:, [0, 2, 1, 3, 4, 5]], "the columns of joint_2 and joint_3 were exchanged"),
+        (lambda q: q[:, ::-1], "all joints were in reverse order"),
         (lambda q: q[:, [0, 1, 2, 5, 4, 3]], "the columns of joint_4 and joint_6 were exchanged"),
         (lambda q: q + np.pi / 2 * np.eye(6)[2], "joint_3 read 90 deg less"),
         (lambda q: q - np.pi / 2 * np.eye(6)[1], "joint_2 read 90 deg more"),
