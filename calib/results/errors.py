@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy import special
 from scipy.linalg import block_diag
 
 from calib.forward import Values
@@ -25,6 +26,7 @@ from calib.solve.estimate import Estimate
 from calib.solve.fit import Progress
 from calib.solve.reweight import unweighted
 
+EXCEEDED = 0.01  # how often a right model may have a larger error: by convention
 OF_POSITIONS = "tracked position"  # what is told of in mm where there are no scans
 
 
@@ -63,6 +65,8 @@ class Errors:
         count: how many there are, those of weight 0 left out, as from the next three sums.
         total_m, squares_m2: sum [m] and sum of squares [m2].
         expected_m2: sum of the variances [m2] that their sigmas lead one to expect.
+        foretold_m2, swing_m2: of this the part that is due to what was foretold of them, and its
+            standard deviation, as all of it may be the error of a few unknowns.
         rejected: how many have weight 0: their beams meet a surface, and they were rejected.
         rejected_m2: sum of the squares of those [m2].
         each_m2: mean square [m2] of each stop, or of each tracked pose as in `poses`, in order;
@@ -75,6 +79,8 @@ class Errors:
     total_m: float = 0.0
     squares_m2: float = 0.0
     expected_m2: float = 0.0
+    foretold_m2: float = 0.0
+    swing_m2: float = 0.0
     rejected: int = 0
     rejected_m2: float = 0.0
     each_m2: tuple[float, ...] = ()
@@ -118,6 +124,23 @@ class Errors:
     @property
     def floor_mm(self) -> float | None:
         return 1e3 * float(np.sqrt(self.expected_m2 / self.count)) if self.count else None
+
+    @property
+    def by_chance_mm(self) -> float | None:
+        """The rms that a right model exceeds once in a hundred times, where something was foretold:
+        that part has a chi-square distribution of as many degrees as its standard deviation says.
+        """
+        if not self.swing_m2:
+            return None
+        degrees = 2.0 * (self.foretold_m2 / self.swing_m2) ** 2
+        most_m2 = self.foretold_m2 * special.chdtri(degrees, EXCEEDED) / degrees
+        return 1e3 * float(np.sqrt((self.expected_m2 - self.foretold_m2 + most_m2) / self.count))
+
+    @property
+    def of_held_out(self) -> dict[str, Any]:
+        """For a run's summary, of stops held out: how large each one's are, and by chance all."""
+        each_mm = (1e3 * np.sqrt(self.each_m2)).tolist()
+        return {"held_out_each_mm": each_mm, "held_out_by_chance_mm": self.by_chance_mm}
 
     @property
     def size(self) -> ErrorSize:
@@ -168,6 +191,18 @@ def judged_mm(summary: Mapping[str, Any]) -> Mapping[str, float | None]:
     return summary.get("rms_pose_mm") or summary["rms_mm"]
 
 
+def over_expected(summary: Mapping[str, Any]) -> float:
+    """The held-out error of a run over the expected one, and no more than 1 where a right model has
+    one as large once in a hundred times, as other stops cannot tell it; 0 where nothing was held
+    out."""
+    judged = judged_mm(summary)
+    error, floor = judged.get("held_out"), judged["noise_floor"]
+    if not error or not floor:
+        return 0.0
+    chance = summary.get("held_out_by_chance_mm") or floor  # which earlier versions lack
+    return min(error / floor, 1.0) if error <= chance else error / floor
+
+
 def tells_of_poses(summary: Mapping[str, Any]) -> bool:
     """Whether the errors by which models are compared are of orientations, too, where these are
     seen: earlier versions told of positions alone."""
@@ -183,21 +218,20 @@ def held_out_size(summary: Mapping[str, Any]) -> ErrorSize | None:
     return ErrorSize(rms_mm, judged["held_out"], judged["noise_floor"], turned)
 
 
-def row_errors(rows: Rows, predicted_m2: np.ndarray | float = 0.0) -> Errors:
-    """Range residuals of a stop's beams that meet a surface.
-
-    Args:
-        rows: the rows.
-        predicted_m2: variance (N,) that the stop's predicted pose adds to what is expected.
-    """
+def row_errors(rows: Rows, known: Foretold | None = None) -> Errors:
+    """Range residuals of a stop's beams that meet a surface; of one that was foretold, how well it
+    was."""
     inlier, lost = rows.weight > 0, rows.usable & (rows.weight == 0)
-    expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m) + predicted_m2
+    expected = np.square(rows.sigma_m) + np.square(rows.reference_sigma_m)
+    foretold_m2, swing_m2 = (0.0, 0.0) if known is None else known.of_rows(rows, inlier)
     r, out = rows.residual_m[inlier], rows.residual_m[lost]
     return Errors(
         count=len(r),
         total_m=float(r.sum()),
         squares_m2=float(r @ r),
-        expected_m2=float(expected[inlier].sum()),
+        expected_m2=float(expected[inlier].sum()) + foretold_m2,
+        foretold_m2=foretold_m2,
+        swing_m2=swing_m2,
         rejected=len(out),
         rejected_m2=float(out @ out),
         each_m2=(float(r @ r) / len(r) if len(r) else np.nan,),
@@ -241,8 +275,9 @@ class Foretold:
             chance={name: np.diag(predicted.covariance_of([name])) for name in drawn},
         )
 
-    def variance_m2(self, rows: Rows) -> np.ndarray:
-        """What that adds (N,) to what is expected of the residuals."""
+    def of_rows(self, rows: Rows, some: np.ndarray) -> tuple[float, float]:
+        """What that adds to the sum of squares that is expected of some (N,) of the residuals, and
+        its standard deviation; what chance does anew has none of note."""
         moves = np.zeros((len(rows.by_twist), len(self.covariance)))
         moves[:, :TWIST] = rows.by_twist
         for name, at in self.beside.items():
@@ -252,14 +287,13 @@ class Foretold:
             met = np.flatnonzero(column.index >= 0)
             at = self.beside[column.variable].start + column.components[column.index[met]]
             moves[met, at] = column.value[met]
-        out = np.einsum("ni,ni->n", moves @ self.covariance, moves)
-        for column in rows.sparse:
-            if column.variable in self.chance:
-                variance = self.chance[column.variable][column.components]
-                out += (
-                    np.where(column.index >= 0, np.square(column.value), 0) * variance[column.index]
-                )
-        return out
+        spread = moves[some].T @ moves[some] @ self.covariance  # of a quadratic form
+        sum_m2, swing_m2 = np.trace(spread), np.sqrt(2.0 * np.einsum("ij,ji->", spread, spread))
+        for column in (c for c in rows.sparse if c.variable in self.chance):
+            met = np.flatnonzero(some & (column.index >= 0))
+            variance = self.chance[column.variable][column.components[column.index[met]]]
+            sum_m2 += np.square(column.value[met]) @ variance
+        return float(sum_m2), float(swing_m2)
 
 
 def body_errors(

@@ -357,5 +357,4 @@ def _unseen(
 ) -> tuple[Errors, Any]:
     """Range residuals of a stop's beams that meet a surface, and what is kept `of` its rows."""
     rows = scan.rows(values, scan.associate(values, near_edges=True))
-    errors = row_errors(rows, 0.0 if known is None else known.variance_m2(rows))
-    return errors, None if of is None else of(rows)
+    return row_errors(rows, known), None if of is None else of(rows)

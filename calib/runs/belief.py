@@ -12,7 +12,7 @@ from calib.blunders.judged import limit_of
 from calib.diagnosis.verdict import HELD_OUT_BY_CHANCE
 from calib.residuals.groups import CAD
 from calib.residuals.levels import Level
-from calib.results.errors import judged_mm
+from calib.results.errors import over_expected
 from calib.results.outstanding import standing_out, together_told
 from calib.results.rings import harmful
 from calib.results.sigmas import TOLERATED
@@ -55,12 +55,6 @@ def _rings(run: Run, bad: bool) -> list[str]:
     return list(dict.fromkeys(told))  # of several recordings the same
 
 
-def over_floor(run: Run) -> float:
-    """The held-out error over the expected one; 0 where nothing was held out."""
-    rms = judged_mm(run.summary)
-    return (rms.get("held_out") or 0.0) / rms["noise_floor"]
-
-
 def cautions(run: Run) -> list[str]:
     """What is to be looked at before a run is used, and does not forbid belief; a clause each."""
     misfit = run.summary["misfit"].items()
@@ -68,7 +62,7 @@ def cautions(run: Run) -> list[str]:
     out = [_misfit(run, kind, x) for kind, x in misfit if least[kind] < x <= FAR_OFF]
     if run.summary["rms_mm"].get("held_out") is None:
         out.append("no stops were held out, so its predictions were not checked")
-    if HELD_OUT_BY_CHANCE < (times := over_floor(run)) <= FAR_OFF:
+    if HELD_OUT_BY_CHANCE < (times := over_expected(run.summary)) <= FAR_OFF:
         out.append(OVER.format(times))
     out += run.summary.get("odd", ())  # which runs of earlier versions lack
     told = [*together_told(run.summary), *standing_out(run.summary)]
@@ -104,7 +98,7 @@ def forbids(run: Run) -> list[str]:
         out.append(f"{run.listed_aside} contradict everything else, and were set aside")
     misfit = run.summary["misfit"].items()
     out += [_misfit(run, kind, times) for kind, times in misfit if times > FAR_OFF]
-    if (times := over_floor(run)) > FAR_OFF:
+    if (times := over_expected(run.summary)) > FAR_OFF:
         out.append(OVER.format(times))
     return [*out, *_rings(run, bad=True)]
 

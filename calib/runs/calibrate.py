@@ -10,8 +10,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib import outputs
 from calib import problem as problems
 from calib.diagnosis.formulas.seen import ColumnRanges
@@ -275,7 +273,7 @@ def _fit(
     by = {**misfit_by(judged, rows, by_stop), "limit": limits(redundancies(rows))}
     summary |= {"misfit": misfit(judged, seen), "misfit_by": by}
     reached = reach(freed.problem, freed, known)
-    summary["held_out_each_mm"] = (1e3 * np.sqrt(unseen.each_m2)).tolist()
+    summary |= unseen.of_held_out
     summary |= {"sigmas_widened_by": known.least, "cad_widened_by": known.cad, "held_out_by": unit}
     summary |= {"rivals": rivals_told(choices.grown_from), "without": list(model.without)}
     summary["intervals_wider_by"] = calibration.document(solution.names)

@@ -30,7 +30,7 @@ from calib.outputs.journal import going_on
 from calib.problem.spread import names_of
 from calib.recalibration.between import contradictions
 from calib.residuals.groups import MESH, Group
-from calib.results.errors import Errors, held_out_size, judged_mm, tells_of_poses
+from calib.results.errors import Errors, held_out_size, judged_mm, over_expected, tells_of_poses
 from calib.results.holdout import Fall, gains_m2, held_out
 from calib.results.observability import not_heard, seen_alone, shown_by_no_other
 from calib.results.outstanding import moves
@@ -45,7 +45,7 @@ from calib.runs.asked.commands import (
     remedies,
 )
 from calib.runs.asked.in_place import InPlace, Untried, in_place, to_be_told
-from calib.runs.belief import cautions, forbids, over_floor
+from calib.runs.belief import cautions, forbids
 from calib.runs.reopen import identity, stand_of
 from calib.runs.run import DIAGNOSIS, Run
 from calib.solve.fit import Progress
@@ -277,7 +277,7 @@ def _falls(found: Search, stand: Stand, run: Run, progress: Progress) -> dict[st
             falls[name] = Fall.of(unseen.size, before, gain)
     last = found.looks[-1].stand
     scatter = [c.effect.name for c in found.chance if c.effect.name in last.model.names]
-    alone = not found.unnamed and over_floor(run) > HELD_OUT_BY_CHANCE
+    alone = not found.unnamed and over_expected(run.summary) > HELD_OUT_BY_CHANCE
     if scatter and (found.found or alone):
         # What scatters is in the expected error only once the model has it.
         unseen = _unseen(last, run, progress)

@@ -40,7 +40,7 @@ from calib.diagnosis.verdict.sentences import (
 )
 from calib.diagnosis.verdict.unnamed import Unnamed
 from calib.residuals.groups import Group
-from calib.results.errors import judged_mm
+from calib.results.errors import judged_mm, over_expected
 from calib.results.holdout import Fall
 
 VERDICTS = {
@@ -284,10 +284,7 @@ def _over_the_expected(
         return 0.0
     if fall := beside_scatter(found, held_out):
         return fall.after_mm / fall.floor_mm
-    rms_mm = judged_mm(summary)
-    error, floor = rms_mm.get("held_out"), rms_mm["noise_floor"]
-    unknown = error is None or not floor or found.chance
-    return 0.0 if unknown else error / floor
+    return 0.0 if found.chance else over_expected(summary)
 
 
 def _unconfirmed(found: Search, over: float) -> tuple[bool, Candidate | None]:

@@ -12,7 +12,7 @@ from calib.report import plots
 from calib.report.chart import Absent, Chart
 from calib.report.evidence import Evidence, folder_name
 from calib.report.statistics import Z_EDGES
-from calib.runs.belief import over_floor
+from calib.results.errors import over_expected
 from calib.runs.ladder import FORMULA, Rung
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def ladder(evidence: Evidence) -> Iterator[Chart | Absent]:
     floor = evidence.run.summary["rms_mm"]["noise_floor"]
     first = error_mm(evidence.rungs[0])[1]
     way = f" from {first:.2f}" if len(evidence.rungs) > 1 else ""
-    over = over_floor(evidence.run)
+    over = over_expected(evidence.run.summary)
     near = "still above" if over > HELD_OUT_BY_CHANCE else "down to" if over > 1.0 else "below"
     yield Chart(
         "ladder",
