@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 from scipy.linalg import block_diag
+from scipy.sparse import csr_array, hstack
 
 from calib.forward import Values
 from calib.linear.parallel import over_stops
@@ -278,22 +279,28 @@ class Foretold:
     def of_rows(self, rows: Rows, some: np.ndarray) -> tuple[float, float]:
         """What that adds to the sum of squares that is expected of some (N,) of the residuals, and
         its standard deviation; what chance does anew has none of note."""
-        moves = np.zeros((len(rows.by_twist), len(self.covariance)))
-        moves[:, :TWIST] = rows.by_twist
-        for name, at in self.beside.items():
-            if name in rows.dense:
-                moves[:, at] = rows.dense[name]
-        for column in (c for c in rows.sparse if c.variable in self.beside):
-            met = np.flatnonzero(column.index >= 0)
-            at = self.beside[column.variable].start + column.components[column.index[met]]
-            moves[met, at] = column.value[met]
-        spread = moves[some].T @ moves[some] @ self.covariance  # of a quadratic form
+        by = [csr_array(rows.by_twist), *(self._by(rows, name) for name in self.beside)]
+        moves = hstack(by, format="csr")[some]
+        spread = (moves.T @ moves) @ self.covariance  # of a quadratic form
         sum_m2, swing_m2 = np.trace(spread), np.sqrt(2.0 * np.einsum("ij,ji->", spread, spread))
         for column in (c for c in rows.sparse if c.variable in self.chance):
             met = np.flatnonzero(some & (column.index >= 0))
             variance = self.chance[column.variable][column.components[column.index[met]]]
             sum_m2 += np.square(column.value[met]) @ variance
         return float(sum_m2), float(swing_m2)
+
+    def _by(self, rows: Rows, name: str) -> csr_array:
+        """Derivative (N, n) of the residuals by one of the unknowns beside."""
+        at = self.beside[name]
+        shape = len(rows.by_twist), at.stop - at.start
+        if name in rows.dense:
+            return csr_array(rows.dense[name])
+        out = csr_array(shape)
+        for column in (c for c in rows.sparse if c.variable == name):
+            met = np.flatnonzero(column.index >= 0)
+            to = column.components[column.index[met]]
+            out += csr_array((column.value[met], (met, to)), shape=shape)
+        return out
 
 
 def body_errors(
