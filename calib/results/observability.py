@@ -27,8 +27,8 @@ PARTNER = 0.1
 LEADS_LAST = 1e-3  # of a preference: any other parameter of a direction leads it
 # Why a parameter is not estimated that is tied to no other.
 UNMEASURED = (
-    "no measurement that has weight depends on it, so its estimate and sigma are those from before "
-    "the fit"
+    "no measurement that has weight depends on it, so its estimate and sigma are what is known "
+    "without one"
 )
 REJECTED_BEAMS = (
     "half or more of the beams that depend on it are rejected; the others may agree by chance, "

@@ -38,7 +38,11 @@ class PointFactors:
         """Priors, trackers and targets as ever, then point by point."""
         graph = gtsam.NonlinearFactorGraph(self.rest._graph)
         for name, keys in self.keys.items():
-            for key, sigma in zip(keys, self.work.problem.variables[name].sigma, strict=True):
+            known = self.work.problem.variables[name]
+            if known.of_members:
+                graph.add(_together(keys, known.sigma))
+                continue
+            for key, sigma in zip(keys, known.sigma, strict=True):
                 noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
                 graph.add(gtsam.PriorFactorVector(key, np.zeros(1), noise))
         for i in range(len(self.work.problem.scans)):
@@ -137,3 +141,16 @@ def _compute(T, chain, ring, away_m, beam, normal, distance, root, factor, value
         for i, d in enumerate(own):
             jacobians[len(chain) + i] = np.array([[root * d]])
     return np.array([root * (range_m - t + shift)])
+
+
+def _together(keys: np.ndarray, sigma: np.ndarray) -> gtsam.CustomFactor:
+    """What is known of numbers about zero whose mean is as uncertain as each is about it."""
+    root = np.linalg.cholesky(np.linalg.inv(np.diag(sigma**2) + np.outer(sigma, sigma))).T
+
+    def rows(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list | None) -> np.ndarray:
+        for i in range(len(keys) if jacobians is not None else 0):
+            jacobians[i] = np.asfortranarray(root[:, [i]])
+        return root @ np.concatenate([values.atVector(int(key)) for key in keys])
+
+    noise = gtsam.noiseModel.Unit.Create(len(keys))
+    return gtsam.CustomFactor(noise, [int(key) for key in keys], rows)

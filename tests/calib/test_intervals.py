@@ -315,9 +315,10 @@ def test_a_ring_without_returns_is_as_well_known_as_before(tmp_path):
     sigma, graph = np.sqrt(np.diag(known.covariance)), np.sqrt(np.diag(known.graph))
     assert np.isfinite(sigma).all() and (sigma >= graph * (1 - 1e-9)).all()
     if "ring_007" in dofs:
-        assert sigma[dofs.index("ring_007")] == pytest.approx(graph[dofs.index("ring_007")])
+        assert sigma[dofs.index("ring_007")] == pytest.approx(graph[dofs.index("ring_007")], 1e-5)
         worse = np.sqrt(np.diag(known.at_least(3.0).covariance))
-        assert worse[dofs.index("ring_007")] == pytest.approx(graph[dofs.index("ring_007")])
+        # Nearly: it is known about the mean of the others, which rows tell.
+        assert worse[dofs.index("ring_007")] == pytest.approx(graph[dofs.index("ring_007")], 1e-4)
         assert np.median(worse / sigma) > 2.0
 
 
