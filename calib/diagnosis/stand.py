@@ -348,16 +348,21 @@ class Look:
         its = {name: there for name, there in every.items() if there.any()}
         away = away_from_model(self.linear, list(its))[:, np.concatenate([*its.values()])]
         away = away @ found.whiten
-        wide, shares = stand.problem, Shares()
+        wide = stand.problem
         if wide.scans:
             wide = stand.problem_of(stand.model.plus((of_look(candidate.effect),)))
+        return found.judged(self.shares(wide, away, progress), self.named.scores)
+
+    def shares(self, problem: Problem, away: np.ndarray, progress: Progress) -> Shares:
+        """Rows of the clusters along directions (U, r), of a problem that has their unknowns."""
 
         def tell(done: int, total: int) -> None:
             progress("fitting the candidates", done, total)
 
-        for rows in rows_along(self.linear, wide, stand.estimate, away, tell):
+        shares = Shares()
+        for rows in rows_along(self.linear, problem, self.stand.estimate, away, tell):
             shares.add(rows.A, rows.stop, rows.place)
-        return found.judged(shares, self.named.scores)
+        return shares
 
 
 def tried(fit: Callable[..., Stand], *of: Any) -> Stand | None:

@@ -281,10 +281,10 @@ class BodyBending(Effect):
     def params(self, rig: Rig) -> tuple[Param, ...]:
         each = [Param("xyz"[i] + "xyz"[j], "m", BENT_M) for i, j in OF_SYMMETRIC]
         each += [Param(name, "rad", BENT_RAD) for name in DOF[:3]]
-        return tuple(replace(p, name=f"{b}.{p.name}") for b in _carried(rig) for p in each)
+        return tuple(replace(p, name=f"{b}.{p.name}") for b in rig.carried for p in each)
 
     def basis(self, view: View) -> np.ndarray:
-        own, tree = _carried(view.rig), view.rig.tree
+        own, tree = view.rig.carried, view.rig.tree
         every = view.rig.tracker.bodies
         basis = np.zeros((len(view.joints), len(every), 6, 9 * len(own)))
         for at, body in enumerate(own):
@@ -314,12 +314,6 @@ def _payloads(view: View) -> list[Mass]:
         for tip, column in load_columns(view.rig).items()
         if column in view.columns
     ]
-
-
-def _carried(rig: Rig) -> tuple[str, ...]:
-    """The tracked bodies that the arm moves."""
-    bodies = rig.tracker.bodies if rig.tracker else ()
-    return tuple(body for body in bodies if rig.joints_to(body))
 
 
 def _per_joint(rig: Rig) -> tuple[Param, ...]:

@@ -121,15 +121,21 @@ class Unknown:
         return tuple(Key(self.name, dof) for dof in self.dofs)
 
     @property
+    def prior_covariance(self) -> np.ndarray:
+        """(dim, dim) by the rows that hold it to its mean: larger where these have less weight."""
+        known = np.diag(np.square(self.sigma))
+        if self.of_members and self.dim > 1:
+            known += np.outer(self.sigma, self.sigma)
+        return known / self.weight
+
+    @property
     def prior_sigma(self) -> np.ndarray:
-        """(dim,) of each of its numbers by the rows that hold it to its mean: larger where these
-        have less weight."""
-        common = self.sigma if self.of_members and self.dim > 1 else 0.0
-        return np.hypot(self.sigma, common) / np.sqrt(self.weight)
+        """(dim,) of each of its numbers by these rows."""
+        return np.sqrt(np.diag(self.prior_covariance))
 
     @property
     def prior_root(self) -> np.ndarray:
-        """(dim, dim) those rows, whitened, by its tangent."""
+        """(dim, dim) these rows, whitened: a square root of the inverse of that covariance."""
         root = np.eye(self.dim)
         if self.of_members and self.dim > 1:
             # The symmetric root of inverse(I + 1 1^T), whose eigenvalue along 1 is 1 / (1 + dim).

@@ -244,9 +244,9 @@ class Foretold:
     """How well it is known where a stop stands that was predicted, and not fitted to its scan.
 
     Args:
-        beside: in a room of planes that were found in the scans, the unknowns that its beams depend
-            on, P numbers: the planes and the effects. Where neither tracker nor mesh is there, all
-            may be shifted together, or be longer together, and no beam reads otherwise.
+        beside: the unknowns that its beams depend on, P numbers: the effects, and planes that were
+            found in the scans. Other stops need not tell an effect; and where neither tracker nor
+            mesh is there, all may be shifted, or be longer, together, and no beam reads otherwise.
         covariance: (6 + P, 6 + P) of the LiDAR's right increment, and of these.
         chance: unknown -> (n,) variances of what chance does anew to each stop or location, which
             no other tells.

@@ -199,7 +199,7 @@ def unit_of(sources: Sequence[Source], by: str) -> str:
     one = len({str(x) for s in sources for x in s.recording.location}) < 2
     still = one or all(s.rig.moves == "never" for s in sources)
     alone = not any(s.rig.lidar and s.recording.has_scan.any() for s in sources)
-    if still and alone and any(_beyond(s) for s in sources):
+    if still and alone and any(s.rig.carried for s in sources):
         return "poses"
     return "stop" if one else by
 
@@ -210,7 +210,7 @@ def pose_blocks(source: Source) -> np.ndarray:
     By k-means over the positions, as tracked, of the bodies beyond the joints, from poses that lie
     as far apart as can be: the same poses give the same blocks.
     """
-    seen = [source.recording.bodies[body][:, :3] for body in _beyond(source)]
+    seen = [source.recording.bodies[body][:, :3] for body in source.rig.carried]
     at = np.hstack([np.zeros((len(source.recording.stops), 0)), *seen])
     at = at[:, np.isfinite(at).any(axis=0)]
     at = np.where(np.isfinite(at), at, np.nanmean(at, axis=0))
@@ -225,12 +225,6 @@ def pose_blocks(source: Source) -> np.ndarray:
 
     _, block = kmeans2(at, at[middles], iter=20, minit="matrix")
     return np.char.mod("block %02d", block)
-
-
-def _beyond(source: Source) -> list[str]:
-    """Tracked bodies that the arm moves."""
-    tracker = source.rig.tracker
-    return [b for b in (tracker.bodies if tracker else ()) if source.rig.joints_to(b)]
 
 
 def near(trained: Problem, progress: Progress, start: Start | None = None) -> Estimate:

@@ -173,6 +173,12 @@ class Rig:
         """Names of the joints that turn."""
         return frozenset(joint.name for joint in self.joints if joint.kind == "revolute")
 
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """The tracked bodies that joints move."""
+        bodies = self.tracker.bodies if self.tracker else ()
+        return tuple(body for body in bodies if self.joints_to(body))
+
     def joints_to(self, frame: str) -> tuple[str, ...]:
         """The moving joints between the root and a frame."""
         edges = (self.tree.edges[i] for i in self.tree.path(frame))

@@ -120,8 +120,8 @@ def _repeated(rig: Rig, recording: RecordedStops, body: str) -> np.ndarray:
 
 
 def _turned_round(recording: RecordedStops, pair: SeenPair) -> Generator[Suspect, None, SeenPair]:
-    """A body that is half a turn from where CAD has it at some stops and not at others; returns the
-    pair without these."""
+    """A body that is half a turn from how it hangs at other stops; returns the pair without those
+    at which it is."""
     if (found := half_turned(pair)) is None:
         return pair
     body, axis, there = found

@@ -6,6 +6,7 @@ from scipy.special import ndtri
 
 from calib.effects import DEFAULT, find
 from calib.problem.model import Model
+from calib.problem.unknowns import vector_unknown
 from calib.results.errors import Errors, over_expected
 from calib.results.holdout import held_out
 from calib.simulation import Spec
@@ -60,3 +61,12 @@ def test_of_few_unknowns_errors_are_seldom_larger_than_chance_makes_them():
             )
         above.append(errors.rms_mm > errors.by_chance_mm)
     assert 0.002 < np.mean(above) < 0.02
+
+
+def test_what_is_known_of_members_before_any_data_is_whitened_by_its_root():
+    sigma, names = np.array([0.05, 0.02, 0.01]), ("a", "b", "c")
+    rings = vector_unknown("x", sigma, names, ["m"] * 3, of_members=True, weight=0.25)
+    assert rings.prior_sigma == pytest.approx(2.0 * np.sqrt(2.0) * sigma)
+    root, expected = rings.prior_root, 4.0 * (np.diag(sigma**2) + np.outer(sigma, sigma))
+    np.testing.assert_allclose(root @ expected @ root.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(rings.prior_covariance, expected)

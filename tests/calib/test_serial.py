@@ -33,9 +33,9 @@ def of_a_body(errors, time_s=None, turn=None, joints=None, poses=None):
     time_s = np.full(len(stops), np.nan) if time_s is None else time_s  # as of no times
     joints = np.zeros((len(stops), 0)) if joints is None else joints
     recording = SimpleNamespace(stops=stops, time_s=time_s, joints=joints)
-    rig = SimpleNamespace(tracker=None, lidar_frame=None)
+    rig = SimpleNamespace(carried=(), lidar_frame=None)
     if poses is not None:
-        rig.tracker, rig.joints_to = SimpleNamespace(bodies=["tool"]), lambda body: ["joint"]
+        rig.carried, rig.joints_to = ("tool",), lambda body: ["joint"]
         rig.tree = SimpleNamespace(place=lambda *_: SimpleNamespace(Ts_root_frame=poses))
         quat = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
         recording.bodies = {"tool": np.hstack([poses[:, :3, 3], quat])}

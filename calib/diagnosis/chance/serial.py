@@ -109,11 +109,10 @@ def _views(source: Source) -> Iterator[np.ndarray]:
     """What an error may go with (K, d) each, NaN where it is not known: which way up is for what
     the arm carries; how the tracker sees it turned; and where."""
     rig, recording = source.rig, source.recording
-    bodies = [b for b in (rig.tracker.bodies if rig.tracker else ()) if rig.joints_to(b)]
-    frame = next((f for f in (rig.lidar_frame, *bodies) if f and rig.joints_to(f)), None)
+    frame = next((f for f in (rig.lidar_frame, *rig.carried) if f and rig.joints_to(f)), None)
     if frame:
         yield rig.tree.place(frame, recording.joints).Ts_root_frame[:, 2, :3]
-    for pose in (recording.bodies[body] for body in bodies[:1]):
+    for pose in (recording.bodies[body] for body in rig.carried[:1]):
         yield se3.from_xyz_quat(pose[:, :3], pose[:, 3:])[:, :3, :3].reshape(-1, 9)
         yield pose[:, :3]
 

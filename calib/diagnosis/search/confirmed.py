@@ -9,8 +9,6 @@ import numpy as np
 from scipy import special
 
 from calib.blunders.chance import LEVELS, after_looks, log_tail
-from calib.diagnosis.judges import Shares
-from calib.diagnosis.linear import rows_along
 from calib.diagnosis.rejects import FEWEST_STOPS
 from calib.diagnosis.score import Scores, ScoreTest, away_from_model, project, score_test
 from calib.diagnosis.screen import ODDS, Candidate, Screen
@@ -89,14 +87,7 @@ def judged_as_fitted(
         return found, 1.0
     own = found.whiten.T @ scores.information @ theta
     away = away_from_model(look.linear, list(scores.at)) @ found.whiten
-
-    def tell(done: int, total: int) -> None:
-        progress("fitting the candidates", done, total)
-
-    shares, stand = Shares(), look.stand
-    for rows in rows_along(look.linear, stand.problem, stand.estimate, away, tell):
-        shares.add(rows.A, rows.stop, rows.place)
-    test = found.at(own, shares, scores)
+    test = found.at(own, look.shares(look.stand.problem, away, progress), scores)
     return test, float(after_looks(test.p_value(), looks))
 
 

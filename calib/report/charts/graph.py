@@ -90,7 +90,7 @@ def graph_rows(estimate: Estimate, kinds: Sequence[RowsOfKind]) -> list[Row]:
     for unknown in estimate.variables:
         k = at[unknown.name]
         bits = {kind.name: _bits(kind.covariance[k, k], C[k, k]) for kind in kinds}
-        cad = np.diag(np.square(unknown.prior_sigma)) if unknown.kind == "vector" else None
+        cad = unknown.prior_covariance if unknown.kind == "vector" else None
         out.append(
             Row(
                 name=unknown.name,

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtrc
 
 from calib.effects import GEOMETRY
@@ -201,18 +202,19 @@ def _apart(pair: Pair, b: Run) -> list[Link]:
     """What became of each link between runs of different recordings; all in sigmas of CAD."""
     sigma = np.concatenate([u.prior_sigma for u in pair.held])
     scale = np.outer(sigma, sigma)
-    poses = np.concatenate([np.full(u.dim, u.kind == "pose") for u in pair.held])
-    cad = np.where(poses, 0.0, 1.0)  # of a pose next to nothing was known
+    # Of a pose next to nothing was known.
+    roots = (u.prior_root * (u.kind != "pose") for u in pair.held)
+    cad = block_diag(*(root.T @ root for root in roots)) * scale
     then = [np.zeros(u.dim) if u.kind == "pose" else pair.then[u.name] for u in pair.held]
     prior = JointPrior(pair.held, pair.then, pair.first.reported)
     _, turned = change(prior, pair.now)
     about_then = (turned @ each @ turned.T for each in (pair.second.graph, pair.second.reported))
     graph, reported = (each / scale for each in about_then)
     weight = np.linalg.inv(graph)
-    information = _nowhere_negative(weight - np.diag(cad))
-    force = weight @ (pair.change / sigma) + cad * np.concatenate(then) / sigma
-    of_cad = cad * (b.summary.get("cad_widened_by", 1.0) ** 2 - 1.0) * pair.is_frame
-    beyond = _nowhere_negative(weight @ (reported - graph) @ weight - np.diag(of_cad))
+    information = _nowhere_negative(weight - cad)
+    force = weight @ (pair.change / sigma) + cad @ (np.concatenate(then) / sigma)
+    wider = (b.summary.get("cad_widened_by", 1.0) ** 2 - 1.0) * pair.is_frame
+    beyond = _nowhere_negative(weight @ (reported - graph) @ weight - cad * wider)
 
     data = NewerData(information / scale, force / sigma, beyond / scale)
     return let_go(prior, data.fitted)
